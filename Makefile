@@ -59,8 +59,9 @@ lint: $(READY) ## style, formatting, types and import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(COMPILED) ## speed of the matchers beside OpenCV's, as JSON
+bench: $(COMPILED) ## speed of the matchers beside OpenCV's, as JSON; of drives beside the last tag, OTHER=…
 	@$(BIN)/python benchmarks/matching.py --json
+	@$(BIN)/python benchmarks/two_checkouts.py $(if $(OTHER),--other $(OTHER))
 
 results: $(COMPILED) ## measure the tables of the pages, or some: ONLY="movers kitti"; hours in all
 	@$(BIN)/python benchmarks/results.py $(if $(ONLY),--only $(ONLY))

@@ -10,7 +10,7 @@ import numpy as np
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.camera import project
-from recon.export.images import DriveImages, open_images
+from recon.export.images import DriveImages
 from recon.export.product import Made, Order
 from recon.io.images.image import write_image
 from recon.io.models.colmap import ColmapModel, Seen, write_colmap
@@ -28,7 +28,7 @@ def colmap_product(order: Order, folder: Path) -> Made:
     """
     images = points = 0
     with write_colmap(folder / "sparse" / "0") as model:
-        for drive in open_images(order.map, order.images):
+        for drive in order.drives:
             check_source(drive.source, stereo=True)
             written = _Written(drive, model, first=points + 1)
             for names, pair in written.frames():
@@ -63,8 +63,7 @@ class _Written:
     def frames(self) -> Iterator[tuple[list[str], tuple[UInt8, ...]]]:
         """Add all frames, one after the other; yield the names of their images, and these."""
         drive, rig = self._drive, self._model.add_rig(self._camera)
-        for frame, pair in drive.pairs():
-            images = drive.rectified(pair)
+        for frame, images in drive.views():
             names = [drive.file(side, frame) for side in ("left", "right")]
             T_camera_map = invert(drive.T_map_camera[frame])
             seen = self._seen(frame, images[0], T_camera_map)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from recon.sources.synthetic import SyntheticSource
 from recon.stereo.rectify.rectifier import Rectifier, turns_of
 from recon.street.settings import StreetSettings
 
+_KEPT_BYTES: Final = 1 << 28  # of a drive's rectified images that stay in memory
+
 
 @dataclass(frozen=True, eq=False)
 class DriveImages:
@@ -34,6 +37,7 @@ class DriveImages:
     prefix: str  # of names, which tells drives apart where there are several
     source: StereoSource
     rig: Rig  # with which it was mapped
+    kept: dict[int, tuple[UInt8, ...]] = field(default_factory=dict, init=False)  # see `views`
 
     @cached_property
     def T_map_camera(self) -> Float64:
@@ -52,9 +56,24 @@ class DriveImages:
     def file(self, side: str, frame: int) -> str:
         return f"{self.prefix}{side}_{frame:06d}.png"
 
-    def pairs(self) -> Iterator[tuple[int, Recorded]]:
+    def views(self) -> Iterator[tuple[int, tuple[UInt8, ...]]]:
+        """Yield number and rectified images of the frames that have a place, the left one first.
+
+        Those of the first frames stay in memory, as many as fit: whoever comes next need not read
+        and rectify them again.
+        """
+        yield from [*self.kept.items()]
+        room = _KEPT_BYTES - sum(one.nbytes for images in self.kept.values() for one in images)
+        for frame, pair in self.pairs(max(self.kept, default=-1) + 1):
+            images = self.rectified(pair)
+            room -= sum(one.nbytes for one in images)
+            if room >= 0:
+                self.kept[frame] = images
+            yield frame, images
+
+    def pairs(self, start: int = 0) -> Iterator[tuple[int, Recorded]]:
         """Yield number and pair of the frames that have a place, one in memory at a time."""
-        first = int(np.argmax(self.placed))
+        first = max(start, int(np.argmax(self.placed)))
         frames = range(first, len(self.placed))
         pairs = zip(frames, self.source.frames(first), strict=False)
         for frame, pair in tracked(pairs, "images", total=len(frames)):

@@ -13,7 +13,7 @@ from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64, UInt8
 from recon.export.cloud import even_sample
-from recon.export.images import DriveImages, open_images
+from recon.export.images import DriveImages
 from recon.export.occupancy import make_grid
 from recon.export.product import Made, Order
 from recon.io.atomic import write_text
@@ -37,7 +37,7 @@ def mcap_product(order: Order, folder: Path) -> Made:
     grid, height_m, _ = make_grid(order.placed)
     images: dict[int, DriveImages] = {}
     try:
-        images = {one.session.number: one for one in open_images(order.map, order.images)}
+        images = {one.session.number: one for one in order.drives}
     except ReconError as error:
         if order.images:
             raise
@@ -106,7 +106,7 @@ class _Drive:
         if images is None:
             yield from ((frame, ()) for frame in np.flatnonzero(self.placed).tolist())
         else:
-            yield from ((frame, images.rectified(pair)) for frame, pair in images.pairs())
+            yield from images.views()
 
     def write(self, bag: RosBag, frame: int, views: tuple[UInt8, ...]) -> None:
         """Write all messages of a frame."""

@@ -20,7 +20,7 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Int64
 from recon.core.values.camera import project
 from recon.export.cloud import even_sample
-from recon.export.images import DriveImages, open_images
+from recon.export.images import DriveImages
 from recon.export.product import Made, Order
 from recon.io.fields import write_json
 from recon.io.images.image import write_image
@@ -41,7 +41,7 @@ def nerfstudio_product(order: Order, folder: Path) -> Made:
 
     Frames are left images; all are matched again, as they were mapped, for their depth.
     """
-    drives, moved = open_images(order.map, order.images), _moved_cells(order.placed.tiles)
+    drives, moved = order.drives, _moved_cells(order.placed.tiles)
     whole = all(drive.rectifier.valid is None or drive.rectifier.valid.all() for drive in drives)
     # All frames have a mask, or none: readers count them.
     masked, frames = None if whole and not len(moved) else moved, []

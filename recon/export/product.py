@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from recon.core.errors import OutputError
 from recon.core.values.arrays import Float64
+from recon.export.images import DriveImages, open_images
 from recon.export.mesh.poisson import MeshSettings
 from recon.map.map import Map
 from recon.map.sessions.georeference import Georeference
@@ -29,6 +31,11 @@ class Order:
     # Where the map is in a survey, as products of surveys are written; None = in its own axes
     survey: Georeference | None = None
     images: Sequence[Path] = ()  # where drives are now, if not where the map says
+
+    @cached_property
+    def drives(self) -> list[DriveImages]:
+        """The linked drives with their images, which all products share; perhaps `ReconError`."""
+        return open_images(self.map, self.images)
 
     @property
     def T_survey_map(self) -> Float64:

@@ -286,7 +286,8 @@ class Rectangle:
 
     def contains(self, points: NDArray[np.floating]) -> Bool:
         """Return which points (N, 2 or 3) lie in the rectangle."""
-        return np.asarray(((points[:, :2] >= self.low) & (points[:, :2] < self.high)).all(axis=1))
+        (x0, y0), (x1, y1), (x, y) = self.low, self.high, points.T[:2]
+        return np.asarray((x >= x0) & (x < x1) & (y >= y0) & (y < y1))
 
     def voxels(self, voxels: OccupancyVoxels) -> OccupancyVoxels:
         """Return the voxels with their centres in the rectangle."""

@@ -320,14 +320,9 @@ class DriveChain:
         # Whether a surface crosses a voxel depends on what hit the blocks that touch its own.
         changed, needed = _grown(blocks, 1), _grown(blocks, 2)
         joined = _outdone(part for _, part in self._drives(key, after, needed))
-        anew = joined.voxels(seen.resolution_m)
-        return join_voxels(
-            [
-                seen.select(~are_among(pack_keys(seen.keys >> BLOCK_BITS), changed)),
-                anew.select(are_among(pack_keys(anew.keys >> BLOCK_BITS), changed)),
-            ],
-            seen.resolution_m,
-        )
+        anew = joined.voxels(seen.resolution_m, changed)
+        kept = seen.select(~are_among(pack_keys(seen.keys >> BLOCK_BITS), changed))
+        return join_voxels([kept, anew], seen.resolution_m)
 
     def _noted(
         self, key: TileKey, drives: Iterable[tuple[int, OccupancyPart]]

@@ -29,6 +29,7 @@ from recon.report.table import NOT_KNOWN
 from recon.run.directory import RunDirectory
 
 _WEBP_QUALITY: Final = 80
+_WEBP_METHOD: Final = 2  # in less than half of the time of the usual 4, a twentieth larger
 _WEBP_MOST_PX: Final = 16_383  # a side of a picture, by its format
 _NOT_TABULATED: Final = frozenset({"stages", "warnings", "findings"})
 
@@ -156,7 +157,7 @@ def _url(image: Image.Image) -> str:
     if max(image.size) > _WEBP_MOST_PX:
         image = image.copy()
         image.thumbnail((_WEBP_MOST_PX, _WEBP_MOST_PX))
-    image.save(buffer, "WEBP", quality=_WEBP_QUALITY)
+    image.save(buffer, "WEBP", quality=_WEBP_QUALITY, method=_WEBP_METHOD)
     return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 

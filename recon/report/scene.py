@@ -251,11 +251,12 @@ def thin_cloud(cloud: PointCloud, limit: int) -> PointCloud:
 def thin_mesh(mesh: TriangleMesh, limit: int) -> TriangleMesh:
     """Return at most about ``limit`` triangles for display, by merging vertices in cells."""
     # Open3D's quadric decimation takes nine times as long, and drops the colours.
-    cell_m, thinned = 0.0, mesh
+    if len(mesh.faces) <= limit:
+        return mesh
+    cell_m, thinned, edge_m = 0.0, mesh, _typical_edge_m(mesh)
     while len(thinned.faces) > limit:
         # The number of triangles falls with the square of the cell size.
-        grown_m = cell_m * math.sqrt(len(thinned.faces) / limit) * 1.05
-        cell_m = max(grown_m, _typical_edge_m(mesh))
+        cell_m = max(cell_m * math.sqrt(len(thinned.faces) / limit) * 1.05, edge_m)
         thinned = _merge_vertices(mesh, cell_m)
     return thinned
 

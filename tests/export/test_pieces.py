@@ -1,6 +1,7 @@
 """Cut meshes meet without a gap, and the surface of a drive is built of such tiles."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -116,6 +117,21 @@ def test_a_seam_whose_neighbour_is_far_stays_as_it_is():
     closed = cut.close_seam(right, plane, cut.open_edges(left, plane), 0.2)
     np.testing.assert_array_equal(closed.vertices, right.vertices)
     np.testing.assert_array_equal(closed.faces, right.faces)
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 11)] * 3), min_size=1, max_size=24))
+def test_faces_that_share_an_edge_are_one_component_numbered_by_its_first_face(corners):
+    faces = np.array(corners, np.int32)
+    sides = [{frozenset(pair) for pair in zip(one, np.roll(one, -1), strict=True)} for one in faces]
+    expected = [*range(len(faces))]
+    for one, other in combinations(range(len(faces)), 2):
+        if sides[one] & sides[other]:
+            low, high = sorted((expected[one], expected[other]))
+            expected = [low if label == high else label for label in expected]
+    labels, sizes = cut.component_labels(faces)
+    numbers = {label: number for number, label in enumerate(sorted(set(expected)))}
+    np.testing.assert_array_equal(labels, [numbers[label] for label in expected])
+    np.testing.assert_array_equal(sizes, np.bincount(labels))
 
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32)

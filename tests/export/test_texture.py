@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from recon.core.errors import MeshingError
 from recon.core.geometry.se3 import T_YUP_FRAME, apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera, TriangleMesh
 from recon.core.values.camera import project, unproject
+from recon.export.images import DriveImages
 from recon.export.mesh.charts import make_atlas, shares_of, texels_of
 from recon.export.mesh.cut import vertex_normals
 from recon.export.mesh.texture import textured_mesh
@@ -125,6 +127,38 @@ def test_what_is_behind_something_is_not_painted_with_it():
     behind = (places[:, 0] > 2) & (places[:, 0] < 4) & (np.abs(places[:, 1]) < 0.5)
     np.testing.assert_array_equal(np.unique(found[behind]), [50])
     assert (found[(places[:, 0] < 1.01) & (np.abs(places[:, 2] - 0.8) < 0.1)] == [255, 0, 0]).any()
+
+
+def test_an_image_that_sees_nothing_of_the_surface_changes_nothing():
+    view = photograph(0, 0.5, 0.0)
+    behind = view.T_map_camera @ make_transform(exp_so3(np.array([0, np.pi, 0])), np.zeros(3))
+    away = photograph(1, 0.5, 0.0)._replace(T_map_camera=behind)
+    expected, found = painted(ground(), [view]), painted(ground(), [view, away])
+    np.testing.assert_array_equal(found[1], expected[1])
+
+
+class Drawn(DriveImages):
+    """A drive whose images are of one value, the number of their frame."""
+
+    def rectified(self, pair):
+        return (np.full((10, 10), pair, np.uint8),)
+
+
+def test_images_that_fit_into_memory_are_read_once(monkeypatch):
+    monkeypatch.setattr("recon.export.images._KEPT_BYTES", 250)
+    read, placed = [], np.array([False, True, True, False, True])
+
+    def frames(start):
+        for frame in range(start, len(placed)):
+            read.append(frame)
+            yield frame
+
+    drive = Drawn(None, placed, "", SimpleNamespace(frames=frames), None)
+    for again in ([1, 2, 3, 4], [3, 4]):
+        read.clear()
+        seen = [(frame, int(left[0, 0])) for frame, (left,) in drive.views()]
+        assert seen == [(1, 1), (2, 2), (4, 4)]
+        assert read == again
 
 
 def test_charts_do_not_overlap_and_keep_lengths():

@@ -6,6 +6,7 @@ import pytest
 from recon.commands.config import load_config
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform, transform_cloud
+from recon.core.kernels.voxels import are_among, pack_keys
 from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, join_voxels
 from recon.core.values.arrays import Float64, tree_of
 from recon.core.values.camera import depth_sigma
@@ -16,6 +17,7 @@ from recon.map.drive import mapper as mapper_file
 from recon.map.drive.mapper import SubmapBuilder
 from recon.map.fusion import FusedPart, FusionSettings, fusion_range_m, join_fused
 from recon.map.ground.surface import find_floors
+from recon.map.kernels.raycast import BLOCK_BITS
 from recon.map.map import Map
 from recon.map.occupancy.part import free_part, join_occupancy
 from recon.map.store.session import Submaps
@@ -187,6 +189,16 @@ def test_what_is_observed_later_changes_a_tile_as_in_one_long_drive(store):
     changed = join_voxels((v.select(inside.contains(v.centres_m)) for inside, v in wide), 0.2)
     assert_same_voxels(changed, expected)
     assert (expected.log_odds < 0).sum() > (seen.log_odds < 0).sum()
+
+
+def test_the_voxels_of_some_blocks_are_those_of_the_whole(store):
+    part = join_occupancy(submap.occupancy for submap in store)
+    blocks = np.sort(part.rows.blocks[::3])
+    some, whole = part.voxels(0.2, blocks), part.voxels(0.2)
+    inside = are_among(pack_keys(whole.keys >> BLOCK_BITS), blocks)
+    assert 0 < len(some) < len(whole)
+    assert_same_voxels(some, whole.select(inside))
+    assert len(part.voxels(0.2, blocks[:0])) == 0
 
 
 def test_a_rectangle_has_the_points_and_voxels_of_all_tiles_below_it(store):

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32, Float64, Int32, Int64
+from recon.export.mesh.cut import components, meeting_sides
 
 _RIGHT: Final = np.array([[0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, -1, 0], [1, 0, 0], [1, 0, 0]])
 _DOWN: Final = np.array([[0, 0, -1], [0, 0, -1], [0, -1, 0], [0, 0, -1], [0, 0, -1], [0, 1, 0]])
@@ -36,6 +36,15 @@ class Atlas:
     width_px: int
     height_px: int
     texel_m: float  # edge of a texel
+
+    @cached_property
+    def sides(self) -> Float64:
+        """float64 (7, F): first corner of each face, the ways to both others, and their product."""
+        a, b, c = self.places[self.mesh.faces].transpose(1, 2, 0)
+        (ux, uy), (vx, vy) = b - a, c - a
+        area = ux * vy - uy * vx
+        area = np.where(np.abs(area) < 1e-12, 1.0, area)  # on edge, as a ray may just hit one
+        return np.stack([*a, ux, uy, vx, vy, area])
 
 
 def make_atlas(mesh: TriangleMesh, texel_m: float, most_px: int) -> Atlas:
@@ -77,11 +86,8 @@ def texels_of(atlas: Atlas) -> tuple[Int32, Int32]:
 
 def shares_of(atlas: Atlas, numbers: Int32, faces: Int32) -> Float32:
     """Return float32 (N, 3), how much each corner of its face counts at the centre of a texel."""
-    at = np.stack([numbers % atlas.width_px, numbers // atlas.width_px], axis=1) + 0.5
-    a, b, c = atlas.places[atlas.mesh.faces[faces]].transpose(1, 0, 2)
-    (ux, uy), (vx, vy), (wx, wy) = (b - a).T, (c - a).T, (at - a).T
-    area = ux * vy - uy * vx
-    area = np.where(np.abs(area) < 1e-12, 1.0, area)  # a face on edge, as a ray may just hit one
+    x, y, ux, uy, vx, vy, area = atlas.sides.take(faces, axis=1)
+    wx, wy = numbers % atlas.width_px + 0.5 - x, numbers // atlas.width_px + 0.5 - y
     second, third = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
     shares = np.stack([1 - second - third, second, third], axis=1)
     return np.asarray(np.clip(shares, 0, 1), np.float32)
@@ -93,7 +99,7 @@ def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     cosines = normals @ _FACING.T
-    facing, pairs, rows = cosines.argmax(axis=1), _neighbours(mesh.faces), np.arange(len(a))
+    facing, pairs, rows = cosines.argmax(axis=1), meeting_sides(mesh.faces) // 3, np.arange(len(a))
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     for _ in range(_SMOOTHINGS):
         votes = np.bincount(6 * ends[:, 0] + facing[ends[:, 1]], minlength=6 * len(a))
@@ -103,23 +109,14 @@ def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:
     return facing, pairs
 
 
-def _neighbours(faces: Int32) -> Int64:
-    """Return int64 (P, 2), the faces on both sides of each inner edge."""
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
-    packed = (edges[:, 0] << 32) | edges[:, 1]
-    order = np.argsort(packed, kind="stable")
-    same = np.flatnonzero(packed[order][1:] == packed[order][:-1])
-    return np.stack([order[same], order[same + 1]], axis=1) // 3
-
-
 def _laid_out(mesh: TriangleMesh, facing: Int64, pairs: Int64, texel_m: float) -> Atlas:
     """Return the atlas with texels of a size."""
     middles = mesh.vertices[mesh.faces].mean(axis=1)
     block = np.floor(middles / (_BLOCK_PX * texel_m)).astype(np.int64)
     one, other = pairs.T
     joined = (facing[one] == facing[other]) & (block[one] == block[other]).all(axis=1)
-    links = coo_matrix((np.ones(joined.sum()), pairs[joined].T), shape=(len(facing),) * 2)
-    charts, chart_of_face = connected_components(links, directed=False)
+    chart_of_face = components(pairs[joined], len(facing))
+    charts = int(chart_of_face.max()) + 1
     packed = (chart_of_face.astype(np.int64)[:, None] << 32) | mesh.faces
     keys, faces = np.unique(packed, return_inverse=True)
     chart, vertex = keys >> 32, keys & 0xFFFFFFFF

@@ -7,11 +7,12 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
 from recon.core.values import TriangleMesh
-from recon.core.values.arrays import Bool, Float32, Float64, Int32
-from recon.io.models import open3d_meshes
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64
 from recon.stereo import open3d_clouds
 
 _CANDIDATES: Final = 8
@@ -193,9 +194,11 @@ def _split_faces(faces: Int32, corners: Int32, edge: Places, new: Int32) -> Int3
 
 def _open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
     """Return boundary edges in a plane, int32 (E, 4): ends, third vertex and number of the face."""
-    number = np.repeat(np.arange(len(mesh.faces), dtype=np.int32), 3)
-    turned = mesh.faces[:, [[0, 1, 2], [1, 2, 0], [2, 0, 1]]].reshape(-1, 3)
-    inside = plane.holds(mesh.vertices)[turned[:, :2]].all(axis=1)
+    held = plane.holds(mesh.vertices)
+    rows = np.flatnonzero(held[mesh.faces].sum(axis=1) >= 2).astype(np.int32)
+    number = np.repeat(rows, 3)
+    turned = mesh.faces[rows][:, [[0, 1, 2], [1, 2, 0], [2, 0, 1]]].reshape(-1, 3)
+    inside = held[turned[:, :2]].all(axis=1)
     turned, number = turned[inside], number[inside]
     _, where, count = np.unique(
         np.sort(turned[:, :2], axis=1), axis=0, return_inverse=True, return_counts=True
@@ -211,8 +214,34 @@ def keep_vertices(vertices: Float32, faces: Int32, keep: Bool) -> tuple[Float32,
 
 def drop_small_components(vertices: Float32, faces: Int32, min_faces: int) -> tuple[Float32, Int32]:
     """Return the connected pieces of a mesh that have at least ``min_faces`` faces."""
-    labels, sizes = open3d_meshes.component_labels(vertices, faces)
+    if min_faces <= 1:
+        return _without_loose(vertices, faces)
+    labels, sizes = component_labels(faces)
     return _without_loose(vertices, faces[sizes[labels] >= min_faces])
+
+
+def component_labels(faces: Int32) -> tuple[Int32, Int32]:
+    """Return int32 (F,), the component of each face, joined by edges, and int32 (C,), their sizes.
+
+    They are numbered by their first faces.
+    """
+    labels = components(meeting_sides(faces) // 3, len(faces))
+    return labels, np.bincount(labels).astype(np.int32)
+
+
+def components(pairs: Int64, count: int) -> Int32:
+    """Return int32 (count,), the connected part of each of ``count`` things, given pairs (P, 2)."""
+    graph = coo_matrix((np.ones(len(pairs), np.bool_), pairs.T), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+
+
+def meeting_sides(faces: NDArray[np.signedinteger]) -> Int64:
+    """Return int64 (P, 2), sides that are one edge; 3f + k begins at corner k of face f."""
+    begin, end = faces.astype(np.int64), np.roll(faces, -1, axis=1)
+    packed = ((np.minimum(begin, end) << 32) | np.maximum(begin, end)).ravel()
+    order = np.argsort(packed, kind="stable")
+    same = np.flatnonzero(packed[order][1:] == packed[order][:-1])
+    return np.stack([order[same], order[same + 1]], axis=1)
 
 
 def vertex_normals(vertices: Float32, faces: Int32) -> Float32:

@@ -13,13 +13,11 @@ from typing import Final
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Bool, Float64, Int32, Int64
-from recon.export.mesh.cut import renumbered, vertex_normals
+from recon.export.mesh.cut import components, meeting_sides, renumbered, vertex_normals
 from recon.export.mesh.poisson import MeshSettings, simplified, usable
 from recon.export.mesh.solid import closed_behind
 
@@ -347,15 +345,12 @@ def _manifold(faces: Int64, least: int, width: int) -> tuple[Int64, Int32]:
     than ``least`` half pixels are left out.
     """
     count = len(faces)
-    begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    key = np.minimum(begin, end) * (begin.max(initial=0) + 1) + np.maximum(begin, end)
-    order = np.argsort(key, kind="stable")
-    same = np.flatnonzero(np.diff(key[order]) == 0)
-    one, other = order[same], order[same + 1]
+    pairs = meeting_sides(faces)
+    one, other = pairs.T
     following = np.arange(3 * count).reshape(-1, 3)[:, [1, 2, 0]].ravel()
     # Two triangles run along a side in opposite directions.
-    links = (np.concatenate([one, following[one]]), np.concatenate([following[other], other]))
-    surface = _components(one // 3, other // 3, count)
+    links = np.stack([np.append(one, following[one]), np.append(following[other], other)], axis=1)
+    surface = components(pairs // 3, count)
     row, column = np.divmod(faces, width)
     area = np.abs(
         (row[:, 0] - row[:, 2]) * (column[:, 1] - column[:, 2])
@@ -365,14 +360,8 @@ def _manifold(faces: Int64, least: int, width: int) -> tuple[Int64, Int32]:
     if not kept.any():
         hint = "lower mesh.min_component_faces, or filter less"
         raise MeshingError("no surface: hardly any pixels with a depth are neighbours", hint=hint)
-    corner = _components(*links, 3 * count).reshape(-1, 3)
+    corner = components(links, 3 * count).reshape(-1, 3)
     pixel = np.zeros(corner.max() + 1, np.int64)
     pixel[corner] = faces
     used, numbered = renumbered(corner[kept])
     return pixel[used], numbered
-
-
-def _components(one: Int64, other: Int64, count: int) -> Int32:
-    """The number (count,) of the connected part of each of ``count`` things, by pairs of them."""
-    graph = coo_matrix((np.ones(len(one), np.bool_), (one, other)), (count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int32)

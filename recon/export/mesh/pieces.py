@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
 from recon.core.kernels.voxels import pack_keys, unpack_keys
@@ -24,6 +22,8 @@ from recon.export.cloud import export_cloud
 from recon.export.mesh.cut import (
     Plane,
     close_seam,
+    component_labels,
+    components,
     cut_mesh,
     nearest_on_edges,
     open_edges,
@@ -34,7 +34,6 @@ from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.voxels import reconstruct_map_surface
 from recon.export.product import Made, Order
-from recon.io.models import open3d_meshes
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.map.cut import Rectangle
@@ -181,9 +180,8 @@ class _Mesher:
     def _large_enough(self) -> Bool:
         """Return bool (C,), components of enough faces, with those that they meet in seams."""
         sizes = np.concatenate([np.zeros(0, np.int32), *self.sizes])
-        one, other = np.concatenate([np.zeros((0, 2), np.int64), *self.seams]).T
-        met = coo_matrix((np.ones(len(one)), (one, other)), shape=(len(sizes),) * 2)
-        whole = connected_components(met, directed=False)[1]
+        met = np.concatenate([np.zeros((0, 2), np.int64), *self.seams])
+        whole = components(met, len(sizes))
         least = self.settings.min_component_faces if self.settings.target_faces is None else 1
         return np.asarray((np.bincount(whole, sizes) >= least)[whole])
 
@@ -236,7 +234,7 @@ class _Mesher:
                 mesh = close_seam(mesh, plane, border.edges, reach_m)
         if not len(mesh.faces):
             return mesh
-        labels, sizes = open3d_meshes.component_labels(mesh.vertices, mesh.faces)
+        labels, sizes = component_labels(mesh.faces)
         first = sum(map(len, self.sizes))
         self.sizes.append(sizes)
         for plane, border in borders.items():
@@ -265,7 +263,7 @@ class _Mesher:
 def _without_crumbs(path: Path, kept: Bool) -> MeshPiece:
     """Write a piece again without some of its components, if not all are kept; none: no file."""
     mesh = read_mesh(path)
-    labels, _ = open3d_meshes.component_labels(mesh.vertices, mesh.faces)
+    labels, _ = component_labels(mesh.faces)
     if not kept.all():
         mesh = with_faces(mesh, mesh.faces[kept[labels]])
         if len(mesh.faces):

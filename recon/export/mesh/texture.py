@@ -13,7 +13,7 @@ from recon.core.errors import MeshingError
 from recon.core.text import counted
 from recon.core.values import Texture, TriangleMesh
 from recon.core.values.image import in_colour
-from recon.export.images import DriveImages, open_images
+from recon.export.images import DriveImages
 from recon.export.mesh.charts import make_atlas
 from recon.export.mesh.pieces import SAMPLE_FACES, WHOLE, mesh_product
 from recon.export.mesh.surveyed import write_surveyed
@@ -36,7 +36,7 @@ def texture_product(order: Order, path: Path) -> Made:
     The formats are those of the mesh that hold a texture, GLB if there is none. The surface is that
     of the folder two levels up, which is made if it is not there.
     """
-    drives, whole = open_images(order.map, order.images), path.parents[1] / WHOLE
+    drives, whole = order.drives, path.parents[1] / WHOLE
     made = None if whole.is_file() else mesh_product(order, whole)
     mesh = read_mesh(whole)
     if len(mesh.faces) > SAMPLE_FACES:
@@ -96,8 +96,8 @@ def posed_images(drives: Sequence[DriveImages]) -> Iterator[PosedImage]:
     """Yield the left images of all frames that have a place, numbered over all drives."""
     first = 0
     for drive in drives:
-        for frame, pair in drive.pairs():
-            colours = in_colour(drive.rectified(pair)[0])
+        for frame, images in drive.views():
+            colours = in_colour(images[0])
             camera, T_map_camera = drive.session.camera, drive.T_map_camera[frame]
             yield PosedImage(first + frame, colours, camera, T_map_camera)
         first += len(drive.placed)
@@ -107,8 +107,8 @@ def _photos(folder: Path, drives: Sequence[DriveImages]) -> Iterator[Photo]:
     """Write the left images of the keyframes, and yield them."""
     for drive in drives:
         keyframes = {*np.asarray(drive.session.keyframes.frames).tolist()}
-        for frame, pair in drive.pairs():
+        for frame, images in drive.views():
             if frame in keyframes:
                 path = folder / drive.file("left", frame)
-                write_image(path, drive.rectified(pair)[0])
+                write_image(path, images[0])
                 yield Photo(path, drive.session.camera, drive.T_map_camera[frame])

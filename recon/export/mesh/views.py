@@ -14,7 +14,7 @@ Graphics 32(4), 2008 (weights instead of seams).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, Final, NamedTuple
 
 import cv2
@@ -169,7 +169,8 @@ def paint(atlas: Atlas, best: BestViews, gains: Float64, views: Iterable[PosedIm
         rgb = atlas.mesh.rgb.astype(np.float32)
         canvas.add(1 - weights.sum(axis=1), lambda at: at.mean_of(rgb))
     for view in views:
-        weight = np.where(frames == view.number, weights, 0).sum(axis=1)
+        own = (np.where(frames[:, k] == view.number, weights[:, k], 0) for k in range(_VIEWS))
+        weight = sum(own, np.zeros(len(frames), np.float32))
         canvas.add(weight, partial(_seen_by, view, gains[view.number], atlas.mesh.vertices))
     return canvas.picture()
 
@@ -182,7 +183,8 @@ class _Texels(NamedTuple):
 
     def mean_of(self, values: Float32) -> Float32:
         """Return the values (V, C) of vertices, interpolated: float32 (N, C)."""
-        return np.asarray(np.einsum("nc,ncd->nd", self.shares, values[self.corners]))
+        each = zip(self.shares.T, self.corners.T, strict=True)  # twice as fast as einsum
+        return reduce(np.add, (share[:, None] * values.take(corner, 0) for share, corner in each))
 
 
 class _Canvas:
@@ -198,9 +200,11 @@ class _Canvas:
 
     def add(self, weight: Float32, colour_of: Callable[[_Texels], Float32]) -> None:
         """Add colours of texels times the weights (V,) of vertices, interpolated."""
-        faces = self._atlas.mesh.faces
-        rows = np.flatnonzero((weight > _NOTHING)[faces].any(axis=1))
+        faces, known = self._atlas.mesh.faces, weight > _NOTHING
+        rows = np.flatnonzero(reduce(np.logical_or, (known[corner] for corner in faces.T)))
         texels = _ranges(self._begin[rows], self._begin[rows + 1])
+        if not len(texels):
+            return
         for part in np.array_split(texels, 1 + len(texels) // _AT_ONCE):
             face = self._faces[part]
             at = _Texels(faces[face], shares_of(self._atlas, self._numbers[part], face))

@@ -60,13 +60,6 @@ def read_mesh(path: StrPath) -> TriangleMesh:
     )
 
 
-def component_labels(vertices: NDArray[Any], faces: NDArray[Any]) -> tuple[Int32, Int32]:
-    """Return int32 (F,), the connected component of each face, and int32 (C,), their sizes."""
-    with _quiet():
-        labels, sizes, _ = _surface(vertices, faces).cluster_connected_triangles()
-    return np.asarray(labels).astype(np.int32), np.asarray(sizes).astype(np.int32)
-
-
 def decimate(
     vertices: NDArray[Any], faces: NDArray[Any], target_faces: int
 ) -> tuple[Float32, Int32]:

@@ -121,9 +121,11 @@ def drop_undecided(voxels: OccupancyVoxels) -> OccupancyVoxels:
 
 def _columns(voxels: OccupancyVoxels) -> tuple[Int64, tuple[int, int], Int64]:
     """Return the lowest column (2,), rows and columns of the grid, and the cell of each voxel."""
-    low = voxels.keys[:, :2].min(axis=0).astype(np.int64)
-    columns, rows = (voxels.keys[:, :2].max(axis=0) - low + 1).tolist()
-    return low, (rows, columns), (voxels.keys[:, :2] - low) @ np.array([1, columns])
+    # One axis after the other: along rows of three, numpy takes many times as long.
+    x, y = (voxels.keys[:, axis].astype(np.int64) for axis in range(2))
+    low = np.array([x.min(), y.min()])
+    columns, rows = int(x.max() - low[0]) + 1, int(y.max() - low[1]) + 1
+    return low, (rows, columns), (y - low[1]) * columns + (x - low[0])
 
 
 def _heights(voxels: OccupancyVoxels, ground: GroundSurface) -> Float64:

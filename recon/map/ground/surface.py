@@ -258,9 +258,9 @@ class _Field:
     def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], Bool]:
         """Return flat index of the cell of each point, and whether it lies on the field."""
         rows, columns = self.heights.shape
-        place = np.floor((xyz[:, :2] - self.origin) / self.cell_m)
-        inside = np.all((place >= 0) & (place < (columns, rows)), axis=1)
-        column, row = np.where(inside, place.T, 0).astype(np.intp)
+        x, y = (np.floor((xyz[:, n] - self.origin[n]) / self.cell_m) for n in range(2))
+        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
+        column, row = np.where(inside, (x, y), 0).astype(np.intp)
         return row * columns + column, np.asarray(inside)
 
 

@@ -17,7 +17,7 @@ from recon.core.geometry.se3 import apply
 from recon.core.kernels import voxels
 from recon.core.kernels.voxels import are_among
 from recon.core.values import OccupancyVoxels
-from recon.core.values.arrays import Float32, Float64, Int32, Int64, array_in, frozen_array
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, array_in, frozen_array
 from recon.map.kernels import clamped, facets, raycast
 from recon.map.kernels.raycast import BLOCK_BITS
 
@@ -88,17 +88,21 @@ class OccupancyPart:
         values = np.stack([change, *ends], axis=1).astype(np.float32)
         return replace(self, rows=self.rows._replace(values=values))
 
-    def voxels(self, resolution_m: float) -> OccupancyVoxels:
+    def voxels(self, resolution_m: float, blocks: Int64 | None = None) -> OccupancyVoxels:
         """Return the log-odds of a drive that consists of this part alone.
 
         A voxel that was hit is undecided unless the surface of the points around it crosses it: the
-        surface is then in the voxel before or behind.
+        surface is then in the voxel before or behind. Only those of packed ``blocks``, ascending,
+        are returned; None = all.
         """
         change, low, high = self.rows.values.T
         cells, log_odds = self.cells, np.minimum(np.maximum(change, low), high)
+        wanted = np.ones(len(cells), np.bool_)
+        if blocks is not None:
+            wanted = np.repeat(are_among(self.rows.blocks, blocks), np.diff(self.rows.starts))
         if self.points is not None:
-            log_odds = _thinned(cells, log_odds, self.points)
-        return OccupancyVoxels(keys=cells, log_odds=log_odds, resolution_m=resolution_m)
+            log_odds = _thinned(cells, log_odds, self.points, wanted)
+        return OccupancyVoxels(cells, log_odds, resolution_m).select(wanted)
 
 
 def _rows_in(tree: Mapping[str, Any]) -> clamped.CellRows:
@@ -114,11 +118,15 @@ def _rows_in(tree: Mapping[str, Any]) -> clamped.CellRows:
     return clamped.CellRows(blocks, starts, cells, tree["values"])
 
 
-def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints) -> Float32:
-    """Return log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses."""
-    hit = np.flatnonzero(log_odds > _UNSURE)
+def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints, wanted: Bool) -> Float32:
+    """Return log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses.
+
+    Those that are not ``wanted`` stay.
+    """
+    hit = log_odds > _UNSURE
     # What was hit and then looked through is no surface: a car that drove off, an outlier.
     points = points.select(are_among(points.keys, voxels.pack_keys(cells[hit])))
+    hit = np.flatnonzero(hit & wanted)
     crossed = facets.crossed_cells(cells[hit], points.keys, points.sums)
     log_odds[hit[~crossed]] = _UNSURE
     return log_odds
