@@ -1,12 +1,14 @@
 """Fixtures shared by all tests: the real data, if available."""
 
 import os
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import hypothesis
 import pytest
 import typer.testing
+
+from recon.sources import synthetic
 
 # The same examples on every machine and in every run: a failure is one of the change at hand.
 # A deadline would fail examples that compile, and any of them on a busy machine.
@@ -33,6 +35,15 @@ def commands_built_once():
     """Let Typer build the tree of commands once, not at each call, where it is most of the time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typer.testing, "_get_command", cache(typer.testing._get_command))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def streets_built_once():
+    """Let sources of equal settings share their street, and what was rendered of it."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("build_street", "StreetCamera"):
+            patch.setattr(synthetic, name, lru_cache(maxsize=8)(getattr(synthetic, name)))
         yield
 
 

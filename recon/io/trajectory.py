@@ -33,7 +33,8 @@ _EUROC_ORDER: Final = [0, 1, 2, 3, 5, 6, 7, 4]  # its quaternion is w x y z
 _COLUMNS: Final = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")  # of TUM
 # A row of data begins with a number; lines before the first may be a header.
 _DATA: Final = re.compile(r"\s*[\"']?[-+.]?\d", re.ASCII)
-_IN_BRACKETS: Final = re.compile(r"\s*[\[(]([^])]*)[\])]")
+_IN_BRACKETS: Final = re.compile(r"(?<!\s)\s*[\[(]([^][()]*)[\])]")
+_LONGEST: Final = 80  # letters of a name that are looked at: what they mean stands at its end
 #: Names of times, quaternions and places, in lower case: of EuRoC, TUM, and what ROS exports.
 _SIGNS: Final = (
     re.compile(r"%?(.*[._])?(t|time\w*|stamp(_[num]?s)?)"),
@@ -171,7 +172,7 @@ def _columns_of(head: str) -> tuple[list[int], float | None] | None:
     names = _parts(_IN_BRACKETS.sub(lambda unit: f"[{unit[1].replace(' ', '')}", head.lower()))
     found: dict[str, int] = {}
     for number, name in enumerate(names):
-        signs = (sign.fullmatch(name.partition("[")[0]) for sign in _SIGNS)
+        signs = (sign.fullmatch(name.partition("[")[0][-_LONGEST:]) for sign in _SIGNS)
         kind = next((kind for kind, sign in zip(("t", "q", ""), signs, strict=True) if sign), None)
         if kind is not None:
             found.setdefault(kind if kind == "t" else kind + name.partition("[")[0][-1], number)

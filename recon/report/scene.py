@@ -233,7 +233,7 @@ def _view_from(points: Float64, turn_rad: float, above_rad: float) -> tuple[int,
     cells = np.floor((place / _HALF_VIEW + 1) / 2 * _CELLS)
     # Not to be moved after the last measurement of what is in view.
     centre = look_at - away * (place.max(axis=0) + place.min(axis=0)) / 2 @ axes
-    return len(np.unique(cells, axis=0)), centre + away * towards, centre
+    return len(np.unique(cells @ [1, 1j])), centre + away * towards, centre
 
 
 def thin_cloud(cloud: PointCloud, limit: int) -> PointCloud:

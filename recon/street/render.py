@@ -48,7 +48,7 @@ class StreetCamera:
     """The rig in a street; renders frames in any order."""
 
     def __init__(self, world: StreetWorld) -> None:
-        self.world = world
+        self.world, self._kept = world, dict[int, StereoPair]()
 
     def __len__(self) -> int:
         return self.world.settings.frames
@@ -74,7 +74,13 @@ class StreetCamera:
         )
 
     def pair(self, index: int) -> StereoPair:
-        """Render only the images."""
+        """Render only the images; once for a short drive, which is looked at, then mapped."""
+        pair = self._kept.get(index) or self._taken(index)
+        if len(self._kept) * (pair.left.nbytes + pair.right.nbytes) < _KEPT_BYTES:
+            self._kept[index] = pair
+        return pair
+
+    def _taken(self, index: int) -> StereoPair:
         # Prepared before the threads start, so that it is done only once.
         views, stage, motion = self.views(index), self.stage, self._motion(index)
         smooth, threads = self.world.settings.smooth_edges, self.world.settings.threads
@@ -135,6 +141,7 @@ class StreetCamera:
         return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
 
 
+_KEPT_BYTES: Final = 64_000_000
 _MOMENTS: Final = 7  # of an exposure that are mixed
 _FAR_M: Final = 1e6  # depth of the sky
 _QUARTERS: Final = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))

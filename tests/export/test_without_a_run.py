@@ -1,7 +1,6 @@
 """Products of a map that is in memory, or open, without the folder of a run."""
 
 import os
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from recon.export.make import PRODUCTS, make
 from recon.export.product import Order
 from recon.io.models import nav2
 from recon.io.models.octomap import read_octomap
-from recon.sources import synthetic
 from tests.map import walls
 
 STREET = {"frames": 8, "width_px": 192, "height_px": 72, "focal_px": 110.0}
@@ -27,10 +25,7 @@ TOOLS |= dict.fromkeys(("dsm", "dtm", "slope", "orthophoto", "occupancy"), "rast
 
 @pytest.fixture(scope="module")
 def mapped():
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("build_street", "StreetCamera"):
-            patch.setattr(synthetic, name, lru_cache(maxsize=2)(getattr(synthetic, name)))
-        yield recon.map_sequence(recon.SyntheticSource(CONFIG.street), CONFIG)
+    return recon.map_sequence(recon.SyntheticSource(CONFIG.street), CONFIG)
 
 
 def files_in(folder: Path) -> dict[str, bytes]:

@@ -1,6 +1,5 @@
 """A small drive with ground truth, mapped once."""
 
-from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -9,22 +8,12 @@ from recon.commands.config import load_config
 from recon.commands.demo import demo_source
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.sources import synthetic
 from recon.street.settings import StreetScene
 from tests.scenery.figures import leave_figures_blank
 from tests.scenery.film import RIG, film
 from tests.scenery.made_once import made_once
 
 SMALL_STREET = {"frames": 12, "width_px": 256, "height_px": 96, "focal_px": 150.0}
-
-
-@pytest.fixture(scope="session", autouse=True)
-def streets_built_once():
-    """Let sources of equal settings share their street, which takes seconds to lay out."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name in ("build_street", "StreetCamera"):
-            patch.setattr(synthetic, name, lru_cache(maxsize=8)(getattr(synthetic, name)))
-        yield
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -112,9 +112,9 @@ def test_a_robot_starts_in_free_space_where_the_camera_stands_on_the_road(small_
 
 def test_a_flown_rig_frees_nothing_below_it(tmp_path):
     size = {"width_px": 256, "height_px": 160, "focal_px": 150.0}
-    source = SyntheticSource(StreetScene(frames=24, path="straight", smooth_edges=False, **size))
+    source = SyntheticSource(StreetScene(frames=14, path="straight", smooth_edges=False, **size))
     poses = source.world.T_street_camera.copy()
-    poses[:, 2, 3] += 0.8 * np.sin(np.arange(24) / 3)
+    poses[:, 2, 3] += 0.8 * np.sin(np.arange(14) / 3)
     source.world = replace(source.world, T_street_camera=poses)
     _map(source, tmp_path, source.trajectory)
     summary = summary_of(tmp_path)

@@ -14,7 +14,9 @@ from recon.commands.map_options import MapOptions
 from recon.core.progress import showing
 from recon.io.images.image import write_image
 from tests.flow.runs import Breaks
+from tests.scenery.figures import leave_figures_blank
 from tests.scenery.kitti import street_drive
+from tests.scenery.made_once import made_once
 
 DRIVE = {"frames": 6, "width_px": 256, "height_px": 96, "focal_px": 150.0}
 STATE = Path(".partial") / ".state"
@@ -49,10 +51,14 @@ def drive(good_drive, here):
 @pytest.fixture(scope="session")
 def good_run(tmp_path_factory):
     config = load_config(None, [f"street.{key}={value}" for key, value in DRIVE.items()])
-    out = tmp_path_factory.mktemp("finished") / "run"
-    options = MapOptions(audit=False, command="demo", out=out, mesh=False)
-    run_map(demo_source(config), config, options)
-    return out
+
+    def make(out: Path) -> None:
+        options = MapOptions(audit=False, command="demo", out=out, mesh=False)
+        with pytest.MonkeyPatch.context() as patch:
+            leave_figures_blank(patch)
+            run_map(demo_source(config), config, options)
+
+    return made_once(tmp_path_factory, "finished", make)
 
 
 @pytest.fixture

@@ -79,10 +79,10 @@ def _add_drive(map_: Map) -> None:
 
 
 def read_map(path: Path) -> None:
-    """Read all that a map keeps, and give it to the loops that trust it."""
+    """Read all that a map keeps of its last drive, and give it to the loops that trust it."""
     with Map.open(path) as map_:
         _ = map_.doubts, map_.links, list(MapViews(map_))
-        for session in map_.sessions:
+        for session in map_.sessions[-1:]:  # the one whose records are spoiled
             _ = session.camera, session.fixes, session.trajectory, session.corrections()
             _ = session.loops, session.state(), session.rig
             _ = [session.rays(frame)[0].cloud() for frame in range(session.ray_frames)]

@@ -161,6 +161,7 @@ TEXTS: Final = {
     "a NUL": b'{"a": "\\u0000"}\x00',
     "a surrogate": b'{"\\ud800": ["\\udfff"]}',
     "nested": b"[" * 100_000,
+    "a long name": b"p_" * 50_000,
     "nested mappings": b'{"a":' * 100_000,
     "not UTF-8": b"\xff\xfe{}",
 }

@@ -222,7 +222,7 @@ def test_a_broken_plugin_is_named_in_one_line(name, words):
     assert "of package go-ahead" in str(raised.value)
 
 
-@pytest.mark.usefixtures("plugin")
+@pytest.mark.usefixtures("plugin", "blank_figures")
 def test_a_drive_is_mapped_with_a_plugin_and_results_name_it(tmp_path):
     source = recon.SyntheticSource(recon.load_config(overrides=[
         "street.frames=4", "street.width_px=256", "street.height_px=96", "street.focal_px=150",
@@ -239,11 +239,10 @@ def test_a_drive_is_mapped_with_a_plugin_and_results_name_it(tmp_path):
 
 
 def test_the_command_line_lists_the_choices(tmp_path):
-    from tests.scenery.kitti import write_kitti
+    from tests.scenery.kitti import street_drive
 
-    config = recon.load_config(overrides=["street.frames=2"])
-    write_kitti(recon.SyntheticSource(config.street), tmp_path / "d")
-    done = CliRunner().invoke(app, ["map", str(tmp_path / "d"), "--odometry", "orb", "--quiet"])
+    drive = street_drive(tmp_path / "d", 2, 64)
+    done = CliRunner().invoke(app, ["map", str(drive), "--odometry", "orb", "--quiet"])
     assert done.exit_code == 1
     assert done.stderr.startswith("error: unknown odometry (got 'orb', expected one of: kiss, sfm,")
     assert done.stderr.count("\n") == 1

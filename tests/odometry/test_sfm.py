@@ -28,6 +28,7 @@ from tests.scenery.film import RIG, Film, film
 from tests.scenery.kitti import street_drive
 from tests.scenery.patience import LONG_S
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
 ORDER = [5, 2, 8, 0, 7, 3, 6, 1, 4]
 OPTIONS = SfmOptions(RectificationSettings(), threads=2)
 

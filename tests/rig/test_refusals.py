@@ -25,6 +25,7 @@ from tests.look import faults
 from tests.rig.test_audit_run import CONFIG, rendered
 from tests.sources import drives
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
 FRAMES = 16
 
 

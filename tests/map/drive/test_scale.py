@@ -13,9 +13,10 @@ from recon.map.drive.scale import measure_scene, scale_of
 from recon.map.drive.sequence import map_sequence
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
-from recon.street.settings import StreetSettings
+from recon.street.settings import StreetScene
+from tests.scenery.film import RIG
 
-STREET = SyntheticSource(StreetSettings(frames=8, width_px=320, height_px=120, focal_px=180.0))
+STREET = SyntheticSource(StreetScene(frames=8, **RIG))
 
 
 def sized(scale: float):

@@ -7,7 +7,7 @@ import cv2
 import numba
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.lib.stride_tricks import sliding_window_view
 
@@ -47,6 +47,7 @@ def convolve_reference(image, weights, scale, bias, slope):
     return np.rint(np.clip(np.where(value > 0, value, slope * value), -32767, 32767))
 
 
+@settings(max_examples=20 if numba.config.DISABLE_JIT else 100)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 5), st.integers(1, 70), st.integers(1, 3))
 def test_layers_equal_plain_convolutions(seed, height, width, count):
     rng = np.random.default_rng(seed)
