@@ -6,7 +6,7 @@
 #
 # uv installs, where it is there or pip gets it, and checks the hashes of constraints.lock; else pip.
 # Safe to repeat: what is there already is left alone, and apt is called only for what is missing.
-# PYTHON=/path/to/python3 chooses the interpreter.
+# PYTHON=/path/to/python3 chooses the interpreter; UV=no leaves all to pip, whose settings uv ignores.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -86,6 +86,7 @@ ensure_venv() {
 
 # The uv of the machine, else that of the lock, in .venv; nothing where it cannot be had.
 find_uv() {
+    [[ ${UV:-} != no ]] || return 0
     command -v uv && return
     if [[ ! -x .venv/bin/uv ]]; then
         sed -n '/^uv==/,/[^\\]$/p' constraints.lock >.venv/uv.txt
@@ -108,7 +109,7 @@ ensure_package() {
     else
         say "uv cannot be had: pip takes some minutes, and does not check the hashes of constraints.lock"
         pip install -c constraints.txt -e "$package"
-    fi || fail "the libraries could not be installed, as said above; what is there stays: run it again"
+    fi || fail "the libraries could not be installed, as said above; what is there stays: run it again${uv:+, with UV=no where only pip knows the way}"
     say "installed in $((SECONDS - begun)) s"
     .venv/bin/python -W ignore -c "import $HEAVY" ||
         fail "the libraries are installed but one cannot be loaded; the line above names it"

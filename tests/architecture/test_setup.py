@@ -105,12 +105,20 @@ def test_where_uv_cannot_be_had_pip_installs_and_what_is_not_checked_is_said(mac
     assert calls[-2].endswith("install -c constraints.txt -e .[dev]")
 
 
+def test_pip_installs_where_that_is_asked_for(machine):
+    machine.write("uv", STUB.format(python=sys.executable))
+    code, said, calls = machine.set_up(UV="no")
+    assert code == 0, said
+    assert not [call for call in calls if call.startswith("uv ")]
+
+
 @pytest.mark.parametrize("fails", ["uv pip install", " install "])
 def test_without_a_network_one_line_says_that_it_can_be_run_again_and_it_can(machine, fails):
     code, said, calls = machine.set_up(fails=fails)
     assert code == 1
     assert said.splitlines()[-1].startswith("setup: the libraries could not be installed")
     assert "run it again" in said
+    assert ("UV=no" in said) == (fails == "uv pip install")
     assert " -W ignore -c import" not in calls[-1]  # nothing goes on after that
     code, said, calls = machine.set_up()
     assert code == 0, said
