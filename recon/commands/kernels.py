@@ -20,14 +20,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, Final, NamedTuple
+from typing import IO, Any, Final, NamedTuple
 
 from numba import config, types
 
 from recon.core.kernels.cache import PACKAGE, announce, note_compiling
 from recon.core.kernels.compiled import CACHE
 from recon.core.machine import available_cores
-from recon.core.progress import tracked
+from recon.core.progress import stage, tracked
 
 RECORDED: Final = Path(__file__).with_name("kernels.json")
 
@@ -50,12 +50,20 @@ def compile_kernels(*needed_by: object) -> int:
     if not missing_calls(*needed_by):
         return 0
     with (CACHE / "compiling").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        _wait_for(lock)
         calls = missing_calls(*needed_by)
         note_compiling()
         for name in tracked(_compiled(calls), "kernels", "kernels", total=len(calls)):
             announce(name)
     return len(calls)
+
+
+def _wait_for(lock: IO[str]) -> None:
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        stage("kernels: another command compiles them")
+        fcntl.flock(lock, fcntl.LOCK_EX)
 
 
 def missing_calls(*needed_by: object) -> list[Call]:
