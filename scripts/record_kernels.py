@@ -27,9 +27,11 @@ from recon.commands.map_options import MapOptions
 from recon.commands.pair import run_pair
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.kernels.cache import PACKAGE, with_imports
+from recon.core.kernels.voxels import distinct_keys, pack_keys
 from recon.core.values import StereoPair
 from recon.io.models.octomap import read_octomap
-from recon.map.drive.sequence import map_sequence
+from recon.map.drive.sequence import MappedSequence, map_sequence
+from recon.map.occupancy.bodies import came_or_went
 from recon.map.tiles import Tiles
 from recon.run.finished import OCTOMAP
 from recon.sources.one_pair import PairInput
@@ -67,6 +69,15 @@ def map_drive(folder: Path) -> None:
     list(frames.frames())
     Calls.seen.clear()
     run_map(frames, config, MapOptions("map", folder / "map", audit=False))
+    look_for_what_moved(map_sequence(frames, config))
+
+
+def look_for_what_moved(mapped: MappedSequence) -> None:
+    """Ask what frames saw of the points of a drive, as if they had moved: here nothing does."""
+    looks = mapped.tiles.looks
+    xyz = np.concatenate([tile.cloud.xyz for tile in mapped.tiles])
+    keys = distinct_keys(pack_keys(np.floor(xyz / looks.settings.resolution_m).astype(np.int64)))
+    came_or_went(keys, np.ones(len(keys), np.bool_), looks.at(keys))
 
 
 def others(folder: Path) -> None:

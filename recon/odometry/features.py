@@ -19,6 +19,7 @@ from recon.core.values import Disparity, Rectified, RectifiedCamera, RectifiedPa
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.core.values.camera import depth_from_disparity, project, unproject
 from recon.odometry.kernels.patches import Placing, place_patches
+from recon.odometry.kernels.slopes import Surface, fit_slopes
 from recon.odometry.pose import REPROJECTION_PX, TrackWindow
 from recon.odometry.protocol import OdometryFrame
 from recon.stereo.match.sad import halve
@@ -286,15 +287,8 @@ _PLACING: Final = Placing(radius=6, steps=10, close=0.03, reach=3.0)
 
 _MIN_CORRELATION: Final = 0.75  # least correlation of a patch with the one it is found as
 _ROW_PX: Final = 1.0  # largest difference between the rows of a feature in the two images of a pair
-_SLOPE_PX: Final = 6
-"""Half width of the neighbourhood whose disparities give the slope of a surface; of which every
-second row and column is taken, as neighbours share their windows anyhow."""
-
-_ON_SURFACE_PX: Final = 1.0
-"""Largest difference between the disparity of a feature's surface and that of a neighbour on it."""
-
-_MIN_NEIGHBOURS: Final = 6  # with fewer neighbours on the surface it counts as upright
-_ROUNDS: Final = 3  # fits of a surface, each to the neighbours that are on the last
+_SURFACE: Final = Surface(radius=6, step=2, near=1.0, least=6, rounds=3)
+"""Every second row and column is taken, as neighbours share their windows anyhow."""
 
 
 def find_again(
@@ -357,31 +351,4 @@ def surface_slopes(disparity: Disparity, uv: Float64) -> Float64:
 
     A plane is fitted to the neighbours that lie on it; 0 where there are too few.
     """
-    offset = np.arange(-_SLOPE_PX, _SLOPE_PX + 1, 2)
-    right, down = (x.ravel() for x in np.meshgrid(offset, offset))
-    column, row = np.rint(uv).astype(np.int64).T
-    height, width = disparity.values.shape
-    rows, columns = row[:, None] + down, column[:, None] + right
-    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    around = disparity.values[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-    around = np.where(inside, around, np.nan).astype(np.float64)
-    A = np.stack([np.ones(len(right)), right, down], axis=1).astype(np.float64)
-    plane = np.zeros((len(uv), 3))
-    plane[:, 0] = disparity.values[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-    for _ in range(_ROUNDS):
-        plane = _refitted(plane, A, around)
-    return plane[:, 1:]
-
-
-def _refitted(plane: Float64, A: Float64, around: Float64) -> Float64:
-    """Planes (N, 3), fitted to the neighbours (N, K) on the last ones; upright if few."""
-    with np.errstate(invalid="ignore"):
-        on = (np.abs(around - plane @ A.T) <= _ON_SURFACE_PX).astype(np.float64)
-    enough = on.sum(axis=1) >= _MIN_NEIGHBOURS
-    terms = (A[:, :, None] * A[:, None, :]).reshape(-1, 9)
-    # A pixel of ridge: neighbours in one line fix no slope across it.
-    H = (on @ terms).reshape(-1, 3, 3) + np.diag([0.0, 1.0, 1.0])
-    H[~enough] = np.eye(3)
-    g = (on * np.nan_to_num(around)) @ A
-    fitted = np.linalg.solve(H, g[:, :, None])[:, :, 0]
-    return np.where(enough[:, None], fitted, plane * [1.0, 0.0, 0.0])
+    return fit_slopes(disparity.values, uv, _SURFACE)

@@ -197,7 +197,7 @@ def _add_points(voxels: Arrays, points: Arrays, edge: float, frame: int, start: 
     """Add points from ``start`` on; return the first that finds no memory left."""
     table, keys, sums, information, best, frames, last, used = voxels
     xyz, weights, values = points
-    columns, rows, row, before = values.shape[1], used[0], used[0], EMPTY
+    columns, rows = values.shape[1], used[0]
     for n in range(start, len(xyz)):
         w = weights[n]
         if not w > 0:
@@ -208,11 +208,10 @@ def _add_points(voxels: Arrays, points: Arrays, edge: float, frame: int, start: 
         x, y, z = xyz[n, 0] / edge, xyz[n, 1] / edge, xyz[n, 2] / edge
         i, j, k = math.floor(x), math.floor(y), math.floor(z)
         key = pack_key(i, j, k)
-        if key != before:  # neighbouring pixels mostly share a voxel
-            row, before = find_or_add(table, key, rows), key
-            if row == rows:
-                keys[row] = key
-                rows += 1
+        row = find_or_add(table, key, rows)
+        if row == rows:
+            keys[row] = key
+            rows += 1
         sums[row, 0] += w
         sums[row, 1] += w * np.float32((x - i - 0.5) * edge)
         sums[row, 2] += w * np.float32((y - j - 0.5) * edge)
