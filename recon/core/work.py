@@ -17,8 +17,8 @@ from threadpoolctl import threadpool_limits
 
 from recon.core.machine import available_cores
 
-_NICER: Final = 5
-"""How much nicer background threads are: beside another on one core they get a quarter."""
+_NICEST: Final = 19
+"""The lowest priority: beside another on one core such a thread gets a seventieth."""
 
 
 FEW: Final = min(2, available_cores())
@@ -47,10 +47,9 @@ def serial_algebra() -> Iterator[None]:
 
 
 def work_in_background() -> None:
-    """Give this thread, and those that it starts, a lower priority, where the system can."""
+    """Give this thread, and those that it starts, the lowest priority, where the system can."""
     if sys.platform == "linux":  # elsewhere the priority is that of the process
-        nice = os.getpriority(os.PRIO_PROCESS, 0) + _NICER
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICEST)
 
 
 Item = TypeVar("Item")
