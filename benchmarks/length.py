@@ -34,6 +34,7 @@ from recon.street.settings import CORNER_M, StreetScene
 from tests.scenery.kitti import write_kitti
 
 STEP_M: Final = 0.7
+MIN_FRAMES: Final = 20  # of which a tenth has a time between two
 LAP: Final = 400  # frames, unless the drive is shorter
 ASPECT: Final = 3 / 8
 ROUND: Final = 1.5  # length of the block, over its width
@@ -59,7 +60,10 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--folder", type=Path, help="where the lap is, or is to be kept")
     parser.add_argument("--set", action="append", default=[], help="a setting of recon map")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    if min(options.frames, options.lap) < MIN_FRAMES:
+        parser.error(f"a drive, and a lap, have {MIN_FRAMES} frames or more")
+    return options
 
 
 def town(frames: int, width_px: int) -> StreetScene:

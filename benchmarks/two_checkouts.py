@@ -101,6 +101,14 @@ def checkout_of(other: str) -> Iterator[Path]:
     if Path(other).is_dir():
         yield Path(other).resolve()
         return
+    found = subprocess.run(
+        ["git", "rev-parse", "--verify", "--quiet", f"{other}^{{commit}}"],
+        cwd=HERE,
+        capture_output=True,
+        check=False,
+    )
+    if found.returncode:
+        sys.exit(f"--other: got {other}, expected a folder or a commit of this repository")
     with tempfile.TemporaryDirectory() as folder:
         there = Path(folder) / "other"
         git("worktree", "add", "--detach", str(there), other)

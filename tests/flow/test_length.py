@@ -43,3 +43,10 @@ def test_a_drive_repeats_pictures_and_poses_of_its_lap(length, tmp_path):
 def test_the_time_of_a_frame_is_that_between_frames(length):
     costs = [length.speed.Cost(0.0, used_s) for used_s in (10.0, 10.5, 12.0)]
     assert length.per_frame(costs) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("words", [["0"], ["2000", "--lap", "3"]])
+def test_what_is_too_short_to_tell_is_refused(length, capsys, words):
+    with pytest.raises(SystemExit):
+        length.parse(words)
+    assert "20 frames or more" in capsys.readouterr().err

@@ -103,3 +103,8 @@ def test_a_checkout_beside_itself_is_as_fast(gate, tmp_path, capsys):
         assert 0 < figures["first_frame_s"] < figures["run_s"]
     assert 0 < found["stereo_bm_s"] < 1
     assert found["code"]["this"] == found["code"]["other"]
+
+
+def test_what_is_no_commit_is_refused_in_one_line(gate):
+    with pytest.raises(SystemExit, match="got nonsense, expected a folder or a commit"):
+        gate.checkout_of("nonsense").__enter__()

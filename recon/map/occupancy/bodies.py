@@ -163,7 +163,7 @@ def strides(steps: Int64) -> Int64:
 
 
 _KEPT_FRAMES: Final = 192
-"""Frames whose rays stay in memory, 60 MB at most: a tile needs those near it again and again."""
+"""Frames whose rays stay in memory, some 0.3 MB each: a tile needs those near it more than once."""
 
 
 class Looks:
