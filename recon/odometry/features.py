@@ -75,20 +75,8 @@ def observe_points(
     uvd[alive, :2] = find_again(state.left, frame.pair.left, uv, warp, guess)
     there = alive[np.isfinite(uvd[alive, 0])]
     uv_now = uvd[there, :2].astype(np.float32)
-    uvd[there, 2] = feature_disparity(frame, uv_now)
+    uvd[there, 2] = known_disparity(frame.disparity, camera, uv_now)
     return uvd
-
-
-def feature_disparity(frame: OdometryFrame, uv: Float32) -> Float64:
-    """The disparity (N,) of features, measured anew where the frame is rough.
-
-    NaN as in `known_disparity`.
-    """
-    d = known_disparity(frame.disparity, frame.pair.camera, uv)
-    if not frame.rough:
-        return d
-    at = uv.astype(np.float64)
-    return measure_disparity(frame.pair, at, d, surface_slopes(frame.disparity, at))
 
 
 def known_disparity(disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
@@ -102,7 +90,7 @@ def replenish(window: TrackWindow, frame: OdometryFrame) -> TrackWindow:
     window = window.without_newest(in_crowd(window.uvd[-1, :, :2], frame.pair.left.shape))
     taken = window.uvd[-1, window.seen[-1], :2].astype(np.float32)
     uv = (find_fewer_corners if frame.rough else find_corners)(frame.pair.left, taken)
-    d = feature_disparity(frame, uv)
+    d = known_disparity(frame.disparity, frame.pair.camera, uv)
     uvd = np.column_stack([uv, d])[np.isfinite(d)]
     return window.with_points(uvd, points_of(uvd, window.T_world_camera[-1], frame.pair.camera))
 
@@ -286,7 +274,6 @@ _PLACING: Final = Placing(radius=6, steps=10, close=0.03, reach=3.0)
 """Patches of 13 pixels, within 3 pixels of where the motion says."""
 
 _MIN_CORRELATION: Final = 0.75  # least correlation of a patch with the one it is found as
-_ROW_PX: Final = 1.0  # largest difference between the rows of a feature in the two images of a pair
 _SURFACE: Final = Surface(radius=6, step=2, near=1.0, least=6, rounds=3)
 """Every second row and column is taken, as neighbours share their windows anyhow."""
 
@@ -326,19 +313,12 @@ def warp_of(
     )
 
 
-def measure_disparity(pair: Rectified, uv: Float64, near: Float64, slope: Float64) -> Float64:
-    """The disparity (N,) of features, measured in the images near a guess, which may be NaN.
-
-    NaN where nothing alike is found on that row; ``slope`` as in `warp_of`.
-    """
-    there = find_in_right(pair, uv, near, slope)
-    with np.errstate(invalid="ignore"):
-        same_row = np.abs(there[:, 1] - uv[:, 1]) <= _ROW_PX
-    return np.where(same_row, uv[:, 0] - there[:, 0], np.nan)
-
-
 def find_in_right(pair: Rectified, uv: Float64, near: Float64, slope: Float64) -> Float64:
-    """Columns and rows (N, 2) of features in the right image; see `measure_disparity`."""
+    """Columns and rows (N, 2) of features in the right image, near a disparity (N,), or NaN.
+
+    NaN where nothing alike is found; ``slope`` as in `warp_of`. For what a rig is fitted to: for
+    poses, disparities of windows on one row are better where the rig is not quite as calibrated.
+    """
     if not isinstance(pair, RectifiedPair):  # there is none: only its disparity says where
         return uv - near[:, None] * [1.0, 0.0]
     warp = np.tile(np.eye(2), (len(uv), 1, 1))

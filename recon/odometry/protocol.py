@@ -17,9 +17,7 @@ class OdometryFrame:
 
     pair: Rectified  # the rectified images
     disparity: Disparity  # what was measured of their disparity; what was inferred is left out
-    # Whether it is off by a quarter of a pixel or more: features are then measured in the images
-    # themselves
-    rough: bool = False
+    rough: bool = False  # whether it is matched in a hurry, and a third of the features do
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "disparity", self.disparity.only_measured())

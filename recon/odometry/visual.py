@@ -15,7 +15,6 @@ from recon.odometry.checked import most_sigma_m
 from recon.odometry.features import (
     VisualState,
     empty_window,
-    feature_disparity,
     follow_points,
     known_disparity,
     observe_points,
@@ -205,7 +204,7 @@ class VisualOdometry:
         uv, uv_now = found.left_uv, found.right_uv
         camera, T_world_then = frame.pair.camera, state.window.T_world_camera[-1]
         then = np.column_stack([uv, known_disparity(state.disparity, camera, uv)])
-        now = np.column_stack([uv_now, feature_disparity(frame, uv_now)])
+        now = np.column_stack([uv_now, known_disparity(frame.disparity, camera, uv_now)])
         known = np.isfinite(then[:, 2])
         then, now = then[known].astype(np.float64), now[known].astype(np.float64)
         window = empty_window(T_world_then).with_points(then, points_of(then, T_world_then, camera))

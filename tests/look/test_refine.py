@@ -101,7 +101,7 @@ def test_a_drive_that_arrives_shows_its_rig_by_every_second_part_of_it(street):
     source = faults.turned(street, yaw_deg=0.25)
     reconstructor, odometry = FrameReconstructor(source.calibration, CONFIG), VisualOdometry()
     tracks, lost = LiveTracks(odometry), OdometryResult(np.eye(4), OdometryHealth(ok=False))
-    there = [OdometryFrame(*reconstructor.match(pair), rough=True) for pair in source.frames()]
+    there = [OdometryFrame(*reconstructor.match(pair)) for pair in source.frames()]
     for n, frame in enumerate([*there, *there[::-1]]):
         tracks.add(n, frame, odometry.register(frame))
     rig = rig_shown(tracks.windows, source.calibration, CONFIG.rectification)

@@ -135,21 +135,19 @@ def test_features_are_found_however_long_the_step(step_m, off_px, see, camera):
         assert (off < 0.5)[near].mean() > 0.7
 
 
-def test_disparities_are_measured_near_rough_ones(see_both):
+def test_features_are_found_in_the_right_image_near_a_rough_disparity(see_both):
     frame = see_both(np.eye(4))
     uv = corners(frame)
     uv = uv[uv[:, 0] > 80]  # seen in the right image, too
     column, row = uv.astype(int).T
     true = frame.disparity.values[row, column].astype(np.float64)
     off = np.random.default_rng(0).uniform(-1.0, 1.0, len(uv))
-    found = features.measure_disparity(
-        frame.pair, uv, true + off, features.surface_slopes(frame.disparity, uv)
-    )
-    near = np.isfinite(found)
+    slopes = features.surface_slopes(frame.disparity, uv)
+    there = features.find_in_right(frame.pair, uv, true + off, slopes)
+    near = np.isfinite(there[:, 0])
     assert near.mean() > 0.6
-    assert np.median(np.abs(found - true)[near]) < 0.05
-    flat = np.zeros((len(uv), 2))
-    assert np.isnan(features.measure_disparity(frame.pair, uv, true + 30.0, flat)).mean() > 0.8
-    assert np.isnan(
-        features.measure_disparity(frame.pair, uv, np.full(len(uv), np.nan), flat)
-    ).all()
+    assert np.median(np.abs(uv[:, 0] - there[:, 0] - true)[near]) < 0.05
+    assert np.median(np.abs(uv[:, 1] - there[:, 1])[near]) < 0.05
+    for wrong in (true + 30.0, np.full(len(uv), np.nan)):
+        found = features.find_in_right(frame.pair, uv, wrong, np.zeros((len(uv), 2)))
+        assert np.isnan(found[:, 0]).mean() > 0.7
