@@ -26,7 +26,7 @@ import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
 
-from recon.commands.config import load_config
+from recon.commands.config import ReconConfig, load_config
 from recon.commands.demo import demo_source
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
@@ -286,6 +286,17 @@ def run(
     """Errors of each odometry on the same frames, with the rig as it is or as refined."""
     config, given = load_config(None, []), altered.calibration
     rig = RefinedRig(given, given, given) if rig is None else rig
+    truth, found = rig.poses(true_path(altered), config.rectification), {}
+    for name, results in follow(altered, odometries, rig, config).items():
+        untrusted = sum(not each.health.ok for each in results)
+        found[name] = {**errors_of(path_of(results, altered), truth), "untrusted": untrusted}
+    return found
+
+
+def follow(
+    altered: Altered, odometries: Mapping[str, Odometry], rig: RefinedRig, config: ReconConfig
+) -> dict[str, list[OdometryResult]]:
+    """What each odometry finds on the same frames, in the axes of the refined rig."""
     reconstructor = FrameReconstructor(rig.calibration, config, threads=1)
     results: dict[str, list[OdometryResult]] = {name: [] for name in odometries}
     with serial_algebra():
@@ -293,12 +304,11 @@ def run(
             frame = OdometryFrame(*reconstructor.match(pair))
             for name, odometry in odometries.items():
                 results[name].append(odometry.register(frame))
-    truth, found = rig.poses(true_path(altered), config.rectification), {}
-    for name, poses in results.items():
-        path = Trajectory(np.stack([each.T_world_camera for each in poses]), altered.stamps_s)
-        untrusted = sum(not each.health.ok for each in poses)
-        found[name] = {**errors_of(path, truth), "untrusted": untrusted}
-    return found
+    return results
+
+
+def path_of(results: Sequence[OdometryResult], altered: Altered) -> Trajectory:
+    return Trajectory(np.stack([each.T_world_camera for each in results]), altered.stamps_s)
 
 
 def errors_of(path: Trajectory, truth: Trajectory) -> dict[str, float]:
