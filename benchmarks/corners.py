@@ -46,6 +46,8 @@ LEAST_INDEPENDENT: Final = 3
 """Segments side by side that a drive must hold for an interval: fewer do not show their spread."""
 _DRAWS: Final = 1000
 _CONFIDENCE: Final = 0.95
+_SURE: Final = 0.998
+"""That of contradictions between differences: there are dozens of them in a drive."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +58,8 @@ class Split:
         squares: float64 (P, 3), estimate and 95 % interval of each path; may be negative.
         pairs: The two paths of each difference.
         between: float64 (pairs, 3), the same of their mean squared difference.
-        beyond: float64 (pairs, 3), the same of what the difference is more than both errors; zero
-            for three paths. Below zero, the two share errors.
+        beyond: float64 (pairs, 3), by how much that is more than the squares of both errors, with
+            99.8 %; zero for three paths. Below zero, the two share errors.
     """
 
     squares: Float64
@@ -67,12 +69,9 @@ class Split:
 
     def shared(self) -> list[tuple[int, int]]:
         """Pairs of programs (path 0 is the truth) whose errors surely depend on each other."""
+        # Of three paths it is zero but for rounding.
         below = self.beyond[:, 2] < -1e-9 * self.between[:, 0].mean()
-        return [
-            pair
-            for pair, is_below in zip(self.pairs, below, strict=True)
-            if is_below & bool(pair[0])
-        ]
+        return [pair for pair, is_so in zip(self.pairs, below, strict=True) if is_so and pair[0]]
 
 
 def differences(paths: Sequence[Trajectory], segments: Segments) -> Float64:
@@ -108,10 +107,12 @@ def split(off: Float64, segments: Segments, path_m: float) -> Split:
     solve = np.linalg.pinv(adds)
     maps = (solve, np.eye(len(pairs)), np.eye(len(pairs)) - adds @ solve)
     mean, drawn = squares.mean(axis=0), _resampled(squares, segments)
-    found = [
-        _with_interval(each @ mean, drawn @ each.T, independent(segments, path_m)) for each in maps
-    ]
-    return Split(found[0], pairs, found[1], found[2])
+    count = independent(segments, path_m)
+    own, between, beyond = (
+        _with_interval(each @ mean, drawn @ each.T, count, confidence)
+        for each, confidence in zip(maps, (_CONFIDENCE, _CONFIDENCE, _SURE), strict=True)
+    )
+    return Split(own, pairs, between, beyond)
 
 
 def _resampled(squares: Float64, segments: Segments) -> Float64:
@@ -134,11 +135,11 @@ def _resampled(squares: Float64, segments: Segments) -> Float64:
     return np.asarray(total[:, :-1] / total[:, -1:])
 
 
-def _with_interval(estimate: Float64, drawn: Float64, count: int) -> Float64:
-    """Estimate and interval (…, 3), as wide as few independent segments make it (Student)."""
+def _with_interval(estimate: Float64, drawn: Float64, count: int, confidence: float) -> Float64:
+    """Estimate and interval (N, 3), as wide as few independent segments make it (Student)."""
     if count < LEAST_INDEPENDENT:
         none = np.full(len(estimate), np.nan)
         return np.column_stack([estimate, none, none])
-    wide = student.ppf(0.5 + _CONFIDENCE / 2.0, count - 1) * np.sqrt(count / (count - 1.0))
+    wide = student.ppf(0.5 + confidence / 2.0, count - 1) * np.sqrt(count / (count - 1.0))
     half = wide * drawn.std(axis=0)
     return np.column_stack([estimate, estimate - half, estimate + half])
