@@ -7,7 +7,7 @@ disparity error common to all frames, and grows with the speed of the drive.
 Without DRIVE, a rendered street is altered.
 
 A peer is another program on the same frames: ``--write`` gives it the altered drives, ``--peer``
-reads its poses, which are evaluated like ours; or its figures, if only these are known.
+reads its poses, which are evaluated like ours.
 
 Example: python benchmarks/altered_drives.py DRIVE --json
 """
@@ -132,8 +132,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--peer",
         type=Path,
-        help="results of another program: a folder of poses (KITTI), every_3rd_frame.txt and so "
-        'on, or a JSON file of figures, {"every 3rd frame": {"t_rel_percent": …, "scale": …}}',
+        help="folder of another program's poses (KITTI), every_3rd_frame.txt and so on",
     )
     return parser.parse_args(arguments)
 
@@ -324,13 +323,11 @@ def errors_of(path: Trajectory, truth: Trajectory) -> dict[str, float]:
 
 def peer_figures(peer: Path, name: str, altered: Altered) -> dict[str, float]:
     """What another program reached, by the same evaluator; empty where it has no such row."""
-    if peer.is_file():
-        found = json.loads(peer.read_text()).get(name, {})
-    else:
-        poses = peer / f"{file_name(name)}.txt"
-        true = true_path(altered)
-        path = read_kitti_poses(poses, true.timestamps_s) if poses.is_file() else None
-        found = {} if path is None else errors_of(path, true)
+    poses = peer / f"{file_name(name)}.txt"
+    if not poses.is_file():
+        return {}
+    true = true_path(altered)
+    found = errors_of(read_kitti_poses(poses, true.timestamps_s), true)
     return {f"peer_{key}": value for key, value in found.items()}
 
 
