@@ -6,10 +6,10 @@ by least squares. An estimate may be negative: then the error is *not resolved*,
 to zero.
 
 What paths share is in no difference. The truth is the one path that no program made, so what all
-programs share (the calibration: its scale, where the camera looks) counts as the truth's, and so
-does what two of three share: a covariance c of two programs lowers the squares of both by c, and
-adds c to the truth's. Of four paths or more the differences contradict each other then
-(`Split.shared`), unless all programs share alike.
+programs share (the calibration: its scale, where the camera looks) counts as the truth's. Of a
+covariance c that two of three paths have, both squares lose c, and the third gains it: the truth's,
+if two programs share it. Of four paths both lose two thirds, and each of the others gains one; but
+then the differences contradict each other (`Split.shared`), unless all programs share alike.
 
 Ref: Gray & Allan, "A method for estimating the frequency stability of an individual oscillator",
 Frequency Control Symposium 1974 (the three-cornered hat); Premoli & Tavella, "A revisited
@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Final
 
+import checkout  # noqa: F401 - what is measured
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student

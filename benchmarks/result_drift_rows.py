@@ -7,6 +7,7 @@ from typing import Any
 Found = dict[str, Any]
 Rows = dict[str, dict[str, Any]]
 TRUTH = "truth's share"
+PEERS = ("ORB-SLAM3", "COLMAP")  # of the first there are poses of all rows
 OF_TRUTH = ", truth"  # how the commands end that print it
 
 
@@ -73,9 +74,10 @@ def altered(found: Found) -> Rows:
 
 
 def truths_share(one: Found, row: str = "as it is") -> str | None:
-    """The error of the truth over the segments of t_rel, as `three_paths.py` prints it."""
-    known = one.get(row)
-    return None if known is None else error(known["t_rel"]["translation"]["errors"]["truth"])
+    """The error of the truth over the segments of t_rel, by ours and the peer of all rows."""
+    if row not in one:
+        return None
+    return error(one[row]["t_rel"]["translation"]["by_three"][PEERS[0]]["truth"])
 
 
 def error(one: Found, unit: str = "%") -> str:
@@ -108,7 +110,13 @@ def known(one: Found) -> bool:
     return any(each["interval"] for each in one["translation"]["errors"].values())
 
 
+def alone(path: str, peer: str) -> str:
+    return f"{path}, by {peer} alone"
+
+
 def errors(one: Found, unit: str = "%") -> dict[str, str]:
     cells = {path: error(each, unit) for path, each in one["errors"].items()}
     cells["ours to truth"] = error(one["differences"]["truth, ours"], unit)
+    for peer, three in one["by_three"].items():
+        cells |= {alone(path, peer): error(three[path], unit) for path in ("truth", "ours")}
     return {**cells, "share errors": "; ".join(one["not_independent"])}

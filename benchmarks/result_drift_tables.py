@@ -91,8 +91,8 @@ DRIFT_TABLES: Final[dict[str, Table]] = {
     "three-paths": Table(
         _TRUTHS,
         {"segments": "{}", "side by side": "{}"}
-        | dict.fromkeys(("truth", "ours", "ORB-SLAM3", "COLMAP", "ours to truth"), "{}")
-        | {"share errors": "{}"},
+        | dict.fromkeys(("truth", "ours", *rows_of.PEERS, "share errors", "ours to truth"), "{}")
+        | {rows_of.alone(path, peer): "{}" for peer in rows_of.PEERS for path in ("truth", "ours")},
         rows_of.three_paths,
     ),
 }

@@ -136,15 +136,22 @@ def compared(paths: Mapping[str, Trajectory]) -> Found:
 
 
 def errors(paths: Mapping[str, Trajectory], segments: Segments) -> Found:
-    """Errors of the paths by component, and how they differ."""
+    """Errors of the paths by component, of all and by truth, ours and one other; differences."""
     names, path_m = list(paths), next(iter(paths.values())).path_length_m
     off = differences(list(paths.values()), segments)
-    splits = {key: split(off[:, :, at], segments, path_m) for key, at in COMPONENTS.items()}
-    return {
+    found: Found = {
         "segments": len(segments.first),
         "independent": independent(segments, path_m),
-        **{key: shown(names, each) for key, each in splits.items()},
     }
+    for key, columns in COMPONENTS.items():
+        found[key] = shown(names, split(off[:, :, columns], segments, path_m))
+        found[key]["by_three"] = {
+            names[peer]: shown(
+                [*names[:2], names[peer]], split(off[[0, 1, peer]][:, :, columns], segments, path_m)
+            )["errors"]
+            for peer in range(2, len(names))
+        }
+    return found
 
 
 def shown(names: Sequence[str], found: Split) -> Found:
@@ -187,6 +194,9 @@ def text(drive: str, name: str, found: Found) -> Iterator[str]:
             yield f"  {key:12s}" + "".join(f"{cell(e):>22s}" for e in one[key]["errors"].values())
             for pair in one[key]["not_independent"]:
                 yield f"    {pair}: not independent, what they share counts as the truth's"
+        three = one["translation"]["by_three"] if len(found["paths"]) > 3 else {}
+        for peer, each in three.items():
+            yield f"  by {peer} alone: truth {cell(each['truth'])}, ours {cell(each['ours'])}"
         apart = one["translation"]["differences"]
         yield "  apart: " + "; ".join(f"{pair} {cell(each)}" for pair, each in apart.items())
 

@@ -1,6 +1,7 @@
 """Errors of paths by how they differ: recovered where independent, doubted where they are not."""
 
 import json
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -96,6 +97,7 @@ def test_what_two_programs_share_counts_as_the_truths(three):
     assert found["not_independent"] == []  # three paths cannot tell
     four = three.compared({**paths, "other": drifted(exact(), 5, 0.004)})["5"]["translation"]
     assert four["not_independent"] == ["ours, theirs"]
+    assert four["by_three"]["theirs"] == found["errors"]
 
 
 def test_a_negative_square_is_not_resolved_and_not_zero(three):
@@ -118,6 +120,38 @@ def test_a_drive_that_holds_too_few_segments_gets_no_intervals(three):
     assert few in "\n".join(three.text("drive", "as it is", found))
 
 
+def test_tables_have_the_truths_share_beside_drift(three, monkeypatch):
+    import results
+
+    paths = [jittered(exact(), 1), drifted(exact(), 2, 0.004), drifted(exact(), 3, 0.004)]
+    truth = {
+        "as it is": three.compared(dict(zip(("truth", "ours", "ORB-SLAM3"), paths, strict=True)))
+    }
+    metres = {"path_length_m": 9.0}
+    path = {"t_rel_percent": 0.7, "r_rel_deg_per_100m": 1.0, "ate_m": 0.1, **metres}
+    printed = {"three_paths.py": truth, "recon map": {"trajectory": path, **metres}}
+    ran = []
+
+    def run_here(line, folder):
+        ran.append(line)
+        return next((found for part, found in printed.items() if part in line), {"f_score": 0.8})
+
+    monkeypatch.setattr(results, "run_here", run_here)
+    monkeypatch.setattr(results, "run_once", cache(lambda line: run_here(line, ROOT)))
+    for table in (results.TABLES["kitti-lenses"], results.TABLES["kitti-sfm"]):
+        rows = results.rows_of(
+            table, {key: results.output(line, ROOT) for key, line in table.commands.items()}
+        )
+        share = truth["as it is"]["t_rel"]["translation"]["errors"]["truth"]["error"]
+        assert {row["truth's share"] for row in rows.values()} == {f"{share:.2f} %"}
+    assert sum("three_paths.py" in line for line in ran) == 6  # of three drives and two rigs, once
+    rows = results.rows_of(
+        results.TABLES["three-paths"], {"street, refined (default), truth": truth}
+    )
+    assert rows["street, refined, 5 m"]["segments"] == truth["as it is"]["5"]["segments"]
+    assert rows["street, refined, 50 m, rotation"]["truth"].endswith("°/100 m")
+
+
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     return street_drive(tmp_path_factory.mktemp("street"), 14, speed_m_per_frame=0.5)
@@ -136,8 +170,6 @@ def test_a_drive_is_compared_with_the_peers_that_are_there(three, street, tmp_pa
     apart = found["as it is"]["5"]["translation"]["differences"]
     assert 0.0 < apart["truth, ours"]["error"] < 5.0
     assert 0.0 < apart["truth, ORB-SLAM3"]["error"] < 0.5  # in the same axes
-    three.main([str(street), "--peers", str(tmp_path), "--only", "as it is"])
-    assert capsys.readouterr().out.startswith(f"{street.name}, as it is: 14 frames, 6.5 m\n")
 
 
 def test_what_cannot_be_compared_is_refused_in_a_line(three, street, tmp_path):
