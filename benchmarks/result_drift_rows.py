@@ -77,15 +77,15 @@ def truths_share(one: Found, row: str = "as it is") -> str | None:
     """The error of the truth over the segments of t_rel, by ours and the peer of all rows."""
     if row not in one:
         return None
-    return error(one[row]["t_rel"]["translation"]["by_three"][PEERS[0]]["truth"])
+    return cell_of(one[row]["t_rel"]["translation"]["by_three"][PEERS[0]]["truth"], " %")
 
 
-def error(one: Found, unit: str = "%") -> str:
+def cell_of(one: Found, unit: str = "") -> str:
     """An error with its interval; below the end of the interval if it is not resolved."""
-    ends, estimate = one["interval"], one["error"]
-    if estimate is None:
-        return "not resolved" if ends is None else f"< {ends[1]:.2f} {unit}"
-    return f"{estimate:.2f}{'' if ends is None else f' ({ends[0]:.2f}–{ends[1]:.2f})'} {unit}"
+    ends, error = one["interval"], one["error"]
+    if error is None:
+        return "not resolved" if ends is None else f"< {ends[1]:.2f}{unit}, not resolved"
+    return f"{error:.2f}{'' if ends is None else f' ({ends[0]:.2f}–{ends[1]:.2f})'}{unit}"
 
 
 def three_paths(found: Found) -> Rows:
@@ -102,7 +102,7 @@ def three_paths(found: Found) -> Rows:
             if apart and m == apart[-1]:
                 for part in ("along", "across", "up"):
                     rows[f"{where}, {part}"] = errors(one[part])
-                rows[f"{where}, rotation"] = errors(one["rotation"], "°/100 m")
+                rows[f"{where}, rotation"] = errors(one["rotation"], " °/100 m")
     return rows
 
 
@@ -114,9 +114,9 @@ def alone(path: str, peer: str) -> str:
     return f"{path}, by {peer} alone"
 
 
-def errors(one: Found, unit: str = "%") -> dict[str, str]:
-    cells = {path: error(each, unit) for path, each in one["errors"].items()}
-    cells["ours to truth"] = error(one["differences"]["truth, ours"], unit)
+def errors(one: Found, unit: str = " %") -> dict[str, str]:
+    cells = {path: cell_of(each, unit) for path, each in one["errors"].items()}
+    cells["ours to truth"] = cell_of(one["differences"]["truth, ours"], unit)
     for peer, three in one["by_three"].items():
-        cells |= {alone(path, peer): error(three[path], unit) for path in ("truth", "ours")}
+        cells |= {alone(path, peer): cell_of(three[path], unit) for path in ("truth", "ours")}
     return {**cells, "share errors": "; ".join(one["not_independent"])}

@@ -20,7 +20,6 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,6 +27,7 @@ import checkout  # noqa: F401 - what is measured
 import numpy as np
 from altered_drives import Altered, alterations, file_name, follow, path_of, true_path
 from corners import COMPONENTS, LEAST_INDEPENDENT, Split, differences, independent, split
+from result_drift_rows import cell_of
 
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import ReconError
@@ -44,23 +44,19 @@ LENGTHS_M: Final = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 400.0, 800.0)
 Found = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Row:
-    """A drive or an alteration of it, with the paths of other programs in the axes of its rig."""
-
-    altered: Altered
-    peers: Mapping[str, Trajectory]
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
     try:
-        config = load_config(None, options.set)
-        rows = rows_of(options.drive, options.peers, options.only)
-        found = {name: compared(paths_of(row, config)) for name, row in rows.items()}
+        config, cases = load_config(None, options.set), alterations(open_source(options.drive))
+        peers = peers_of(cases, options)
+        found = {name: compared(paths_of(cases[name], peers[name], config)) for name in peers}
     except ReconError as error:
         raise SystemExit(f"three_paths: {error}") from error
-    lines = (line for name, one in found.items() for line in text(options.drive.name, name, one))
+    lines = (
+        line
+        for name, one in found.items()
+        for line in text(options.drive.resolve().name, name, one)
+    )
     print(json.dumps(found, indent=2) if options.json else "\n".join(lines))
 
 
@@ -74,51 +70,51 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
-def rows_of(drive: Path, folder: Path, only: Sequence[str] | None) -> dict[str, Row]:
-    """The rows to compare; without ``only`` those of which poses of a peer are there.
+def peers_of(
+    cases: Mapping[str, Altered], options: argparse.Namespace
+) -> dict[str, dict[str, Trajectory]]:
+    """Paths of other programs by row; without ``--only`` of those rows that have one.
 
     Raises:
         SystemExit: A row is not known or has no path of a peer, or there are none at all.
     """
-    cases = alterations(open_source(drive))
-    unknown = [name for name in only or () if name not in cases]
+    chosen, drive = options.only or list(cases), options.drive.resolve().name
+    unknown = [name for name in chosen if name not in cases]
     if unknown:
         raise SystemExit(f"three_paths: no row {unknown[0]!r}; there are {', '.join(cases)}")
-    rows = {
-        name: Row(cases[name], peers_of(folder, drive, name, cases[name])) for name in only or cases
-    }
-    lacking = [name for name, row in rows.items() if not row.peers]
-    if lacking and (only or len(lacking) == len(rows)):
-        where = folder / "PROGRAM" / drive.name / f"{file_name(lacking[0])}.txt"
+    found = {name: read_peers(options.peers, f"{drive}/{file_name(name)}.txt", cases[name])
+             for name in chosen}  # fmt: skip
+    lacking = [name for name in chosen if not found[name]]
+    if lacking and (options.only or lacking == chosen):
+        where = options.peers / "PROGRAM" / drive / f"{file_name(lacking[0])}.txt"
         raise SystemExit(f"three_paths: no poses of another program: expected {where}")
     if lacking:
         print(f"no poses of another program: {', '.join(lacking)}", file=sys.stderr, flush=True)
-    return {name: row for name, row in rows.items() if row.peers}
+    return {name: peers for name, peers in found.items() if peers}
 
 
-def peers_of(folder: Path, drive: Path, name: str, altered: Altered) -> dict[str, Trajectory]:
+def read_peers(folder: Path, file: str, altered: Altered) -> dict[str, Trajectory]:
     """The paths of other programs by name, those that are known first."""
-    files = {
-        program: folder / program / drive.name / f"{file_name(name)}.txt"
-        for program in [*NAMES, *sorted({path.name for path in folder.glob("*/")} - NAMES.keys())]
-    }
-    stamps_s = true_path(altered).timestamps_s
+    others = sorted({path.name for path in folder.glob("*/")} - NAMES.keys())
     return {
-        NAMES.get(program, program): read_kitti_poses(file, stamps_s)
-        for program, file in files.items()
-        if file.is_file()
+        NAMES.get(program, program): read_kitti_poses(path, true_path(altered).timestamps_s)
+        for program in [*NAMES, *others]
+        if (path := folder / program / file).is_file()
     }
 
 
-def paths_of(row: Row, config: ReconConfig) -> dict[str, Trajectory]:
-    """Truth, ours and others, all in the axes of the refined rig; the truth is the first."""
-    print(f"follow {len(row.altered)} frames", file=sys.stderr, flush=True)
-    rig = refine_rig(row.altered, config, config.rig)
+def paths_of(
+    altered: Altered, peers: Mapping[str, Trajectory], config: ReconConfig
+) -> dict[str, Trajectory]:
+    """Truth, ours and others (given in the axes of the rig as given), in the refined rig's axes."""
+    print(f"follow {len(altered)} frames", file=sys.stderr, flush=True)
+    rig = refine_rig(altered, config, config.rig)
     odometry = make_odometry("visual", config.odometry)
-    found = follow(row.altered, {"ours": odometry}, rig, config)["ours"]
-    given = {"truth": true_path(row.altered), **row.peers}
-    paths = {name: rig.poses(path, config.rectification) for name, path in given.items()}
-    return {"truth": paths.pop("truth"), "ours": path_of(found, row.altered), **paths}
+    ours = path_of(follow(altered, {"ours": odometry}, rig, config)["ours"], altered)
+    truth, *others = (
+        rig.poses(path, config.rectification) for path in (true_path(altered), *peers.values())
+    )
+    return {"truth": truth, "ours": ours, **dict(zip(peers, others, strict=True))}
 
 
 def compared(paths: Mapping[str, Trajectory]) -> Found:
@@ -191,22 +187,16 @@ def text(drive: str, name: str, found: Found) -> Iterator[str]:
         what = length if length == "t_rel" else f"{length} m"
         yield f"{what}: {one['segments']} segments, {one['independent']} side by side{few}"
         for key in COMPONENTS:
-            yield f"  {key:12s}" + "".join(f"{cell(e):>22s}" for e in one[key]["errors"].values())
+            yield f"  {key:12s}" + "".join(
+                f"{cell_of(e):>22s}" for e in one[key]["errors"].values()
+            )
             for pair in one[key]["not_independent"]:
-                yield f"    {pair}: not independent, what they share counts as the truth's"
+                yield f"    {pair}: share errors, so that the split is not theirs"
         three = one["translation"]["by_three"] if len(found["paths"]) > 3 else {}
         for peer, each in three.items():
-            yield f"  by {peer} alone: truth {cell(each['truth'])}, ours {cell(each['ours'])}"
+            yield f"  by {peer} alone: truth {cell_of(each['truth'])}, ours {cell_of(each['ours'])}"
         apart = one["translation"]["differences"]
-        yield "  apart: " + "; ".join(f"{pair} {cell(each)}" for pair, each in apart.items())
-
-
-def cell(one: Found) -> str:
-    """An error and its interval; one that is not resolved is below the end of the interval."""
-    ends, error = one["interval"], one["error"]
-    if error is None:
-        return "not resolved" if ends is None else f"< {ends[1]:.2f}, not resolved"
-    return f"{error:.3f}" if ends is None else f"{error:.3f} ({ends[0]:.2f}–{ends[1]:.2f})"
+        yield "  apart: " + "; ".join(f"{pair} {cell_of(each)}" for pair, each in apart.items())
 
 
 if __name__ == "__main__":
