@@ -7,7 +7,7 @@ disparity error common to all frames, and grows with the speed of the drive.
 Without DRIVE, a rendered street is altered.
 
 A peer is another program on the same frames: ``--write`` gives it the altered drives, ``--peer``
-reads its poses, which are evaluated like ours; or its figures, if only these are known.
+reads its poses, which are evaluated like ours.
 
 Example: python benchmarks/altered_drives.py DRIVE --json
 """
@@ -26,7 +26,7 @@ import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
 
-from recon.commands.config import load_config
+from recon.commands.config import ReconConfig, load_config
 from recon.commands.demo import demo_source
 from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, SequenceTruth, StereoPair, Trajectory
@@ -132,8 +132,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--peer",
         type=Path,
-        help="results of another program: a folder of poses (KITTI), every_3rd_frame.txt and so "
-        'on, or a JSON file of figures, {"every 3rd frame": {"t_rel_percent": …, "scale": …}}',
+        help="folder of another program's poses (KITTI), every_3rd_frame.txt and so on",
     )
     return parser.parse_args(arguments)
 
@@ -286,6 +285,17 @@ def run(
     """Errors of each odometry on the same frames, with the rig as it is or as refined."""
     config, given = load_config(None, []), altered.calibration
     rig = RefinedRig(given, given, given) if rig is None else rig
+    truth, found = rig.poses(true_path(altered), config.rectification), {}
+    for name, results in follow(altered, odometries, rig, config).items():
+        untrusted = sum(not each.health.ok for each in results)
+        found[name] = {**errors_of(path_of(results, altered), truth), "untrusted": untrusted}
+    return found
+
+
+def follow(
+    altered: Altered, odometries: Mapping[str, Odometry], rig: RefinedRig, config: ReconConfig
+) -> dict[str, list[OdometryResult]]:
+    """What each odometry finds on the same frames, in the axes of the refined rig."""
     reconstructor = FrameReconstructor(rig.calibration, config, threads=1)
     results: dict[str, list[OdometryResult]] = {name: [] for name in odometries}
     with serial_algebra():
@@ -293,12 +303,11 @@ def run(
             frame = OdometryFrame(*reconstructor.match(pair))
             for name, odometry in odometries.items():
                 results[name].append(odometry.register(frame))
-    truth, found = rig.poses(true_path(altered), config.rectification), {}
-    for name, poses in results.items():
-        path = Trajectory(np.stack([each.T_world_camera for each in poses]), altered.stamps_s)
-        untrusted = sum(not each.health.ok for each in poses)
-        found[name] = {**errors_of(path, truth), "untrusted": untrusted}
-    return found
+    return results
+
+
+def path_of(results: Sequence[OdometryResult], altered: Altered) -> Trajectory:
+    return Trajectory(np.stack([each.T_world_camera for each in results]), altered.stamps_s)
 
 
 def errors_of(path: Trajectory, truth: Trajectory) -> dict[str, float]:
@@ -314,13 +323,11 @@ def errors_of(path: Trajectory, truth: Trajectory) -> dict[str, float]:
 
 def peer_figures(peer: Path, name: str, altered: Altered) -> dict[str, float]:
     """What another program reached, by the same evaluator; empty where it has no such row."""
-    if peer.is_file():
-        found = json.loads(peer.read_text()).get(name, {})
-    else:
-        poses = peer / f"{file_name(name)}.txt"
-        true = true_path(altered)
-        path = read_kitti_poses(poses, true.timestamps_s) if poses.is_file() else None
-        found = {} if path is None else errors_of(path, true)
+    poses = peer / f"{file_name(name)}.txt"
+    if not poses.is_file():
+        return {}
+    true = true_path(altered)
+    found = errors_of(read_kitti_poses(poses, true.timestamps_s), true)
     return {f"peer_{key}": value for key, value in found.items()}
 
 

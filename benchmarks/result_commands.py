@@ -1,8 +1,41 @@
-"""The commands of the tables: parts that several share."""
+"""What a table is, and parts of commands and formats that several share."""
 
 from __future__ import annotations
 
-from typing import Final
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from result_drift_rows import Rows
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table."""
+
+    commands: dict[str, str]  # shell lines, by name
+    columns: dict[str, str]  # format of the cells, by heading
+    # What makes the cells of the printed JSON of all commands, by label and heading.
+    rows: Callable[[dict[str, Any]], Rows]
+    timed: bool = False  # whether it depends on what else the machine does
+    scenes: str = ""  # what the rows that name no scene are of, as in `tuned_on.py`
+
+    def lacking(self) -> str:
+        """What is needed and not there; empty if nothing is."""
+        words = " ".join(self.commands.values()).split()
+        data = [word for word in words if word.startswith("$RECON_DATA")]
+        if data and not os.environ.get("RECON_DATA"):
+            return "RECON_DATA is not set"
+        missing = [word for word in data if not Path(os.path.expandvars(word)).exists()]
+        return f"there is no {missing[0]}" if missing else ""
+
+
+PERCENT: Final = "{:.2f} %"
+SHARE: Final = "{:.3f}"
+CM: Final = "{:.1f} cm"
+MB: Final = "{:.0f} MB"
 
 DRIVES: Final = {
     "kitti_raw_0013": "$RECON_DATA/driven/kitti_raw_0013",
@@ -51,3 +84,10 @@ def against_lidar(name: str, *options: str) -> str:
 
 def scored(scenes: str, name: str, matchers: str, *options: str) -> str:
     return " ".join([scenes, "--matcher", matchers, *options, f"--out $OUT/{name}"])
+
+
+def truth_of(drive: str, *options: str) -> str:
+    """What other programs say of the truth of a drive: each table with drift runs it, once."""
+    return " ".join(
+        [f'python benchmarks/three_paths.py {drive} --only "as it is" --json', *options]
+    )

@@ -6,7 +6,7 @@ import re
 from statistics import fmean
 from typing import Any
 
-from result_rows import Found, Rows
+from result_drift_rows import Found, Rows
 
 
 def middlebury(found: Found) -> Rows:

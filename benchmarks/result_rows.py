@@ -8,33 +8,8 @@ from __future__ import annotations
 
 from math import hypot
 from statistics import median
-from typing import Any
 
-Found = dict[str, Any]
-Rows = dict[str, dict[str, Any]]
-
-
-def drift(found: Found) -> Rows:
-    """Both odometries on both drives; of kiss-icp the median over ranges."""
-    rows: Rows = {}
-    for drive in [name.removesuffix(" visual") for name in found if name.endswith(" visual")]:
-        one, many = found[f"{drive} visual"], found[f"{drive} kiss"]["spread"]
-        path = one["trajectory"]
-        rows[f"{drive}, `visual`"] = {
-            "t_rel": path["t_rel_percent"],
-            "r_rel": path["r_rel_deg_per_100m"],
-            "ATE": 100 * path["ate_m"],
-            "not trusted": one["frames_not_trusted"],
-        }
-        t_rel = many["t_rel_percent"]
-        rows[f"{drive}, `kiss`"] = {
-            "t_rel": t_rel["median"],
-            "least to most": f"{t_rel['least']:.2f} to {t_rel['most']:.2f} %",
-            "r_rel": many["r_rel_deg_per_100m"]["median"],
-            "ATE": 100 * many["ate_m"]["median"],
-            "not trusted": round(many["untrusted"]["median"]),
-        }
-    return rows
+from result_drift_rows import OF_TRUTH, TRUTH, Found, Rows, truths_share
 
 
 def lidar(found: Found) -> Rows:
@@ -48,37 +23,6 @@ def lidar(found: Found) -> Rows:
     return {
         label: {heading: one[key] for heading, key in names.items()} for label, one in found.items()
     }
-
-
-def lenses(found: Found) -> Rows:
-    """Drift, and F of the map beside the drive that it was measured for."""
-    rows: Rows = {}
-    for label, one in found.items():
-        path = one.get("trajectory")
-        if path is None:
-            rows[label.removesuffix(", F")]["F, own path"] = one["f_score"]
-            continue
-        rows[label] = {
-            "t_rel": path["t_rel_percent"],
-            "r_rel": path["r_rel_deg_per_100m"],
-            "ATE": 100 * path["ate_m"],
-            "length": one["path_length_m"] / path["path_length_m"],
-        }
-    return rows
-
-
-def altered(found: Found) -> Rows:
-    """Both rigs side by side; the peer, which refines none, once."""
-    rows: Rows = {}
-    for label, cases in found.items():
-        drive, _, how = label.partition(", ")
-        for case, one in cases.items():
-            row = rows.setdefault(f"{drive}, {case}", {})
-            row["refined" if how.startswith("refined") else "as calibrated"] = one["t_rel_percent"]
-            row["length"] = one["scale"]
-            if "peer_scale" in one:
-                row["ORB-SLAM3"], row["its length"] = one["peer_t_rel_percent"], one["peer_scale"]
-    return rows
 
 
 def disparities(found: Found) -> Rows:
@@ -106,7 +50,9 @@ def depths(found: Found) -> Rows:
 def planted(found: Found) -> Rows:
     rows: Rows = {}
     for drive, faults in found.items():
-        without = faults["none"].get("t_rel_percent")
+        if drive.endswith(OF_TRUTH):
+            continue
+        share, without = found.get(f"{drive}{OF_TRUTH}", {}), faults["none"].get("t_rel_percent")
         for name, one in faults.items():
             if name == "none":
                 continue
@@ -117,6 +63,7 @@ def planted(found: Found) -> Rows:
             }
             if without is not None:
                 row |= {"t_rel": one["t_rel_percent"], "without it": without}
+                row[TRUTH] = truths_share(share)
     return rows
 
 
@@ -251,6 +198,7 @@ def halves(found: Found) -> Rows:
         "kitti_raw_0013": {
             "t_rel, one run": one["t_rel_percent"]["one run"],
             "merged": one["t_rel_percent"]["merged"],
+            TRUTH: truths_share(found["truth"]),
             "paths apart": 1000 * one["path_apart_m"],
             "cells that differ": 100 * one["grid"]["differ"],
             "free against occupied": 100 * one["grid"]["free_against_occupied"],
@@ -319,6 +267,7 @@ def live(found: Found) -> Rows:
             "dropped": played["frames_dropped"],
             "tracked, not matched": played["frames_not_matched"],
             "t_rel": played["t_rel_percent"],
+            TRUTH: truths_share(found["truth"]),
             "memory": played["peak_memory_mb"],
         }
         for rate, played in one["rates"].items()

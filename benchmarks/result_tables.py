@@ -6,70 +6,38 @@ commands of a table share; the last command of a line prints JSON.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import result_pair_rows as pair_rows_of
 import result_rows as rows_of
 from result_commands import (
+    CM,
     D06,
     D13,
     DRIVES,
     FILLED,
     HALF_SIZE,
     KNOWN_POSES,
+    MB,
     MEASURED,
     MIDDLEBURY,
     OPENCV,
     PADDED,
-    REFINED,
+    PERCENT,
     RIGS,
+    SHARE,
+    Table,
     against_lidar,
     map_drive,
     scored,
+    truth_of,
 )
-from result_rows import Rows
+from result_drift_rows import OF_TRUTH, TRUTH
+from result_drift_tables import DRIFT_TABLES
 
-
-@dataclass(frozen=True)
-class Table:
-    """One table."""
-
-    commands: dict[str, str]  # shell lines, by name
-    columns: dict[str, str]  # format of the cells, by heading
-    # What makes the cells of the printed JSON of all commands, by label and heading.
-    rows: Callable[[dict[str, Any]], Rows]
-    timed: bool = False  # whether it depends on what else the machine does
-    scenes: str = ""  # what the rows that name no scene are of, as in `tuned_on.py`
-
-    def lacking(self) -> str:
-        """What is needed and not there; empty if nothing is."""
-        words = " ".join(self.commands.values()).split()
-        data = [word for word in words if word.startswith("$RECON_DATA")]
-        if data and not os.environ.get("RECON_DATA"):
-            return "RECON_DATA is not set"
-        missing = [word for word in data if not Path(os.path.expandvars(word)).exists()]
-        return f"there is no {missing[0]}" if missing else ""
-
-
-PERCENT: Final = "{:.2f} %"
-SHARE: Final = "{:.3f}"
-CM: Final = "{:.1f} cm"
-MB: Final = "{:.0f} MB"
 TABLES: Final[dict[str, Table]] = {
-    "kitti-drift": Table(
-        {f"{name} visual": map_drive(drive, name[-2:]) for name, drive in DRIVES.items()}
-        | {
-            f"{name} kiss": f"python benchmarks/kiss_spread.py {drive} --json"
-            for name, drive in DRIVES.items()
-        },
-        {"t_rel": PERCENT, "least to most": "{}", "r_rel": "{:.2f} °/100 m", "ATE": CM}
-        | {"not trusted": "{}"},
-        rows_of.drift,
-    ),
+    **DRIFT_TABLES,
     "kitti-lidar": Table(
         {
             f"known poses{how}": map_drive(D13, f"known{n}", f"--poses {D13}/poses.txt", options)
@@ -85,43 +53,6 @@ TABLES: Final[dict[str, Table]] = {
         },
         dict.fromkeys(("precision", "recall", "F", "precision in reach", "F in reach"), SHARE),
         rows_of.lidar,
-    ),
-    "kitti-lenses": Table(
-        {
-            f"{name}, {how}": map_drive(drive, f"{key}{how[:2]}", *options)
-            for name, (drive, key) in RIGS.items()
-            for how, options in REFINED.items()
-        }
-        | {
-            f"kitti_raw_0013, {how}, F": against_lidar(
-                f"13{how[:2]}", f"--align-to {D13}/poses.txt"
-            )
-            for how in REFINED
-        },
-        {"t_rel": "{:.3f} %", "r_rel": "{:.2f} °/100 m", "ATE": CM, "length": "{:.4f}"}
-        | {"F, own path": SHARE},
-        rows_of.lenses,
-    ),
-    "kitti-sfm": Table(
-        {
-            f"{name}, {how}": map_drive(drive, f"sfm{key}{how[:2]}", "--odometry sfm", *options)
-            for name, (drive, key) in RIGS.items()
-            if name != "sequence 06"  # whose truth begins late
-            for how, options in REFINED.items()
-        },
-        {"t_rel": "{:.3f} %", "r_rel": "{:.2f} °/100 m", "ATE": CM, "length": "{:.4f}"},
-        rows_of.lenses,
-    ),
-    "kitti-altered": Table(
-        {
-            f"{name}, {how}": f"python benchmarks/altered_drives.py {drive} --json "
-            f"--peer benchmarks/peers/orbslam3/{Path(drive).name}.json {' '.join(options)}"
-            for name, drive in DRIVES.items()
-            for how, options in REFINED.items()
-        },
-        {"as calibrated": PERCENT, "refined": PERCENT, "length": "{:.4f}"}
-        | {"ORB-SLAM3": PERCENT, "its length": "{:.4f}"},
-        rows_of.altered,
     ),
     "kitti-disparity": Table(
         {"": f"python benchmarks/lidar_disparity.py {D13} {D13}/lidar_map.ply --json"},
@@ -149,9 +80,10 @@ TABLES: Final[dict[str, Table]] = {
                 "driven/kitti_05_100",
                 "walked/backyard",
             )
-        },
+        }
+        | {f"{Path(drive).name}{OF_TRUTH}": truth_of(drive) for drive, _ in RIGS.values()},
         {"planted": "{:.2f} px", "left": "{:.2f} px", "recovered": "{:.0f} %"}
-        | {"t_rel": PERCENT, "without it": PERCENT},
+        | {"t_rel": PERCENT, "without it": PERCENT, TRUTH: "{}"},
         rows_of.planted,
     ),
     "kitti-localize": Table(
@@ -161,8 +93,14 @@ TABLES: Final[dict[str, Table]] = {
         rows_of.localized,
     ),
     "kitti-halves": Table(
-        {"halves": f"python benchmarks/merge.py --parts halves --drive {D13} --json"},
-        {"t_rel, one run": "{:.3f} %", "merged": "{:.3f} %", "paths apart": "{:.0f} mm"}
+        {"halves": f"python benchmarks/merge.py --parts halves --drive {D13} --json"}
+        | {"truth": truth_of(D13)},
+        {
+            "t_rel, one run": "{:.3f} %",
+            "merged": "{:.3f} %",
+            TRUTH: "{}",
+            "paths apart": "{:.0f} mm",
+        }
         | {"cells that differ": PERCENT, "free against occupied": PERCENT},
         rows_of.halves,
     ),
@@ -181,9 +119,10 @@ TABLES: Final[dict[str, Table]] = {
         timed=True,
     ),
     "kitti-live": Table(
-        {"drive": f"python benchmarks/live.py {D13} --rates 1 2 --only-live --json"},
+        {"drive": f"python benchmarks/live.py {D13} --rates 1 2 --only-live --json"}
+        | {"truth": truth_of(D13)},
         {"p50": "{:.0f} ms", "p95": "{:.0f} ms", "largest": "{:.0f} ms", "dropped": "{}"}
-        | {"tracked, not matched": "{}", "t_rel": PERCENT, "memory": MB},
+        | {"tracked, not matched": "{}", "t_rel": PERCENT, TRUTH: "{}", "memory": MB},
         rows_of.live,
         timed=True,
     ),

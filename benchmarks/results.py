@@ -21,11 +21,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from result_tables import TABLES, Table
+from result_commands import Table
+from result_tables import TABLES
 from tuned_on import LEGEND, mark
 
 ROOT: Final = Path(__file__).resolve().parents[1]
@@ -118,6 +120,16 @@ def shown(form: str, value: Any) -> Any:
 
 
 def output(line: str, folder: Path) -> Any:
+    """Run a line, or remember what it printed: several tables share those that write no files."""
+    return run_here(line, folder) if "$OUT" in line else run_once(line)
+
+
+@cache
+def run_once(line: str) -> Any:
+    return run_here(line, Path())
+
+
+def run_here(line: str, folder: Path) -> Any:
     """Run a line in this clone; the JSON that its last command prints.
 
     Raises:
