@@ -9,6 +9,7 @@ Rows = dict[str, dict[str, Any]]
 TRUTH = "truth's share"
 PEERS = ("ORB-SLAM3", "COLMAP")  # of the first there are poses of all rows
 OF_TRUTH = ", truth"  # how the commands end that print it
+SHOWN = ("10", "50", "t_rel")  # lengths of segments; the command prints more
 
 
 def drift(found: Found) -> Rows:
@@ -93,7 +94,7 @@ def three_paths(found: Found) -> Rows:
     rows: Rows = {}
     for label, drive in found.items():
         name, how = label.removesuffix(OF_TRUTH).partition(" (")[0], drive["as it is"]
-        lengths = {key: one for key, one in how.items() if isinstance(one, dict)}
+        lengths = {key: how[key] for key in SHOWN if key in how}
         apart = [m for m, one in lengths.items() if m != "t_rel" and known(one)]
         for m, one in lengths.items():
             where = f"{name}, {m}" if m == "t_rel" else f"{name}, {m} m"
