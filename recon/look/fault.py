@@ -204,12 +204,13 @@ def _relensed(
 
 
 def shrink(
-    values: Float64, H: Float64, sigmas: Float64, spread: float = 1.0
+    values: Float64, H: Float64, sigmas: Float64, moved: Float64 | None = None
 ) -> tuple[Float64, Float64, float]:
     """Return parameters (P,) moved to 0 in directions that the drive does not show.
 
     Beside them the mean squares (P, P) of their errors, of which what is moved is part, and the
-    variance of faults, in that expected and at least ``spread``, by those that are shown.
+    variance of faults, in that expected, by those that are shown: these, and what was ``moved``
+    (P,) before.
 
     Each direction, whitened by the prior, is shrunk by its own certainty: not at all where the
     drive fixes it well, to 0 where it is within its standard deviation. ``H`` (P, P) is the
@@ -224,10 +225,12 @@ def shrink(
     shown = (D > 0.0) & (z != 0.0)
     chance = np.divide(D, (z * (1.0 + D)) ** 2, where=shown, out=np.ones_like(D))
     kept = sigmas * (V @ (np.maximum(0.0, 1.0 - chance) * z))
-    told = (H + np.diag(1.0 / sigmas**2)) @ values
-    spread = _spread(told, H, sigmas, spread)
+    moved = np.zeros_like(values) if moved is None else moved
+    told = (H + np.diag(1.0 / sigmas**2)) @ values + H @ moved
+    spread = _spread(told, H, sigmas)
     likely, covariance = _widened(told, H, sigmas, spread)
-    return kept, covariance + np.outer(likely - kept, likely - kept), spread
+    left = likely - moved - kept
+    return kept, covariance + np.outer(left, left), spread
 
 
 def _widened(told: Float64, H: Float64, sigmas: Float64, spread: float) -> tuple[Float64, Float64]:
@@ -238,19 +241,19 @@ def _widened(told: Float64, H: Float64, sigmas: Float64, spread: float) -> tuple
     return covariance @ told, np.asarray(covariance)
 
 
-def _spread(told: Float64, H: Float64, sigmas: Float64, least: float) -> float:
+def _spread(told: Float64, H: Float64, sigmas: Float64) -> float:
     """Return the variance of what lenses bend, in that expected, that makes ``told`` likeliest.
 
     Where they are worse than expected in directions that the drive shows, they are in others, too.
 
     Ref: MacKay, "Bayesian interpolation", 1992.
     """
-    spread, lens = least, slice(len(TURN), None)
+    spread, lens = 1.0, slice(len(TURN), None)
     for _ in range(_WEIGHINGS if len(sigmas) > len(TURN) else 0):
         values, covariance = _widened(told, H, sigmas, spread)
         shown = 1.0 - np.diag(covariance)[lens] / (spread * sigmas[lens] ** 2)
         bent = np.sum((values[lens] / sigmas[lens]) ** 2)
-        spread = max(least, float(bent / max(shown.sum(), _ROUNDING)))
+        spread = max(1.0, float(bent / max(shown.sum(), _ROUNDING)))
     return spread
 
 

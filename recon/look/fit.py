@@ -5,11 +5,12 @@ Bundle adjustment of a few windows that share the fault; poses and points are el
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RectifiedCamera
@@ -17,7 +18,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
 from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.look.fault import Places, RigFault, shrink
-from recon.look.tracks import StereoTracks
+from recon.look.tracks import StereoTracks, turns
 from recon.odometry.kernels import bundle
 from recon.odometry.pose import (
     CAUCHY_SIGMAS,
@@ -35,6 +36,8 @@ _LAST_STEP: Final = 1.0  # length of a step, in standard deviations, after which
 _ROUNDING: Final = 1e-9  # share of the best known direction below which one is not known at all
 _RECALLED: Final = 4  # last rounds that the next one learns from
 _FIRST: Final = 4  # every so many-th track is fitted first, so that few rounds take all of them
+_QUARTERS: Final = 4  # parts of the features of a window that lie alike
+_ENOUGH: Final = 100  # tracks of a window that show by how much it depends on where they lie
 _ROW_SIGMA_PX: Final = 0.3  # standard deviation of the row of a feature in the right image
 _IN_STEP: Final = 0.02
 """Frames by which right images may seem late where one trigger takes both: on drives with one it is
@@ -56,6 +59,8 @@ class FittedFault:
     late: float = 0.0  # frames by which right images are taken later than left ones
     late_sigma: float = float("nan")
     spread: float = 1.0  # variance of what lenses bend, in that expected beforehand, 1 or more
+    fixed: bool = True  # False: it turns with the images, as those of a stabilised video do
+    alike: float = 0.0  # standard deviation of the path's length by features that lie alike, share
 
 
 def fit_fault(
@@ -63,7 +68,7 @@ def fit_fault(
     fault: RigFault,
     active: Bool,
     before: FittedFault | None = None,
-    spread: float = 1.0,
+    moved: Float64 | None = None,
 ) -> FittedFault:
     """Fit the ``active`` parameters to windows of tracks; the others are 0.
 
@@ -71,14 +76,19 @@ def fit_fault(
     fitted with them.
 
     What an earlier drive of the same rig knew ``before`` counts as windows of this one in which the
-    rig has no fault, as far as this drive does not contradict it. ``spread`` is that of an earlier
-    fit to this one: of what it left, the well known part is gone.
+    rig has no fault, as far as this drive does not contradict it. ``moved`` are parameters (P,) by
+    which the rig was corrected before.
 
     Features of a window err together. By how much windows contradict each other beyond what their
-    features let expect, what they know counts less.
+    features let expect, what they know counts less; and so it does by how much it depends on where
+    features lie, since those that lie alike err alike in all windows.
+
+    What is wrong with a rig is so at places of its images. Where it turns with what is seen
+    instead, no rig explains it, and nothing is corrected.
 
     Ref: Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986 (the
-    covariance of clustered data).
+    covariance of clustered data); Efron, "The jackknife, the bootstrap and other resampling plans",
+    1982.
     """
     active = np.append(active, True)
     sigmas = np.append(fault.sigmas, _LATE_SIGMA)[active]
@@ -88,9 +98,8 @@ def fit_fault(
     few = [part.thinned(_FIRST) for part in tracks]
 
     def linearised(part: StereoTracks, window: TrackWindow) -> tuple[TrackWindow, _System]:
-        places = fault.correct(part.window.uvd[..., :2], part.right_uv, values[:-1])
-        places = _in_time(places, window, fault.camera, values[-1])
-        window = adjust(_seen(window, part, places), fault.camera)
+        places, window = _corrected(part, window, fault, values)
+        window = adjust(window, fault.camera)
         return window, _system(window, places, fault.camera)
 
     for parts in (few, tracks):
@@ -122,11 +131,58 @@ def fit_fault(
             if step @ (shown + prior) @ step < _LAST_STEP**2:
                 break
     rig, covariance = active[:-1], np.zeros((len(active) - 1,) * 2)
-    own, known, late, sigma = _without_late(values[active], shown, sigmas)
-    values[:-1][rig], covariance[np.ix_(rig, rig)], spread = shrink(own, known, sigmas[:-1], spread)
+    parts = [
+        replace(part, window=replace(window, uvd=part.window.uvd))
+        for part, window in zip(tracks, windows, strict=True)
+    ]
+    off = _by_likeness(parts, fault, values, active, (held + prior) * scatter)
+    own, shown, late, sigma = _without_late(values[active], shown, sigmas)
+    moved = None if moved is None else moved[rig]
+    values[:-1][rig], squares, spread = shrink(own, shown, sigmas[:-1], moved)
+    covariance[np.ix_(rig, rig)] = squares + off[:-1, :-1]
+    fixed = not all(turns(part, fault, values[:-1]) for part in tracks)
+    if not fixed:
+        covariance += np.outer(values[:-1], values[:-1])
+        values[:-1] = 0.0
     stretch = _stretch(found)[:-1]
-    count = len(tracks)
-    return FittedFault(values[:-1], covariance, stretch, scatter, count, late, sigma, spread)
+    alike = float(np.sqrt(stretch[rig] @ off[:-1, :-1] @ stretch[rig]))
+    others = (late, sigma, spread, fixed, alike)
+    return FittedFault(values[:-1], covariance, stretch, scatter, len(tracks), *others)
+
+
+def _by_likeness(
+    parts: Sequence[StereoTracks], fault: RigFault, values: Float64, active: Bool, prior: Float64
+) -> Float64:
+    """Return mean squares (P, P) of errors that features share which lie alike.
+
+    They are by how much parameters change without a quarter of them, the leftmost for instance.
+    """
+
+    def left(part: StereoTracks) -> tuple[Float64, Float64]:
+        part, found = part.thinned(every := max(1, part.right_uv.shape[1] // _ENOUGH)), []
+        for at in _without_quarters(part.window, fault.camera):
+            fewer = part.chosen(at)
+            places, window = _corrected(fewer, fewer.window, fault, values)
+            found.append(_system(window, places, fault.camera))
+        times = every * _QUARTERS / (_QUARTERS - 1)
+        H, g, _ = (times * np.stack(terms) for terms in zip(*found, strict=True))
+        return H[:, active][:, :, active], g[:, active] + H[:, active] @ values
+
+    with serial_algebra():
+        each = list(side_by_side(left, parts, threads=FEW))
+    H, told = (np.sum(terms, axis=0) for terms in zip(*each, strict=True))
+    found = np.linalg.solve(H + prior, told[..., None]).reshape(-1, _QUARTERS, len(prior))
+    apart = (found - found.mean(axis=1, keepdims=True)).reshape(-1, len(prior))
+    return np.asarray(apart.T @ apart) * (_QUARTERS - 1) / _QUARTERS
+
+
+def _without_quarters(window: TrackWindow, camera: RectifiedCamera) -> Iterator[NDArray[np.int64]]:
+    """Yield the points of a window but each quarter: by column, row, disparity, and radius."""
+    middle = np.nansum(window.uvd, axis=0) / np.isfinite(window.uvd).sum(axis=0).clip(1)
+    radius = np.linalg.norm(middle[:, :2] - [camera.cx_px, camera.cy_px], axis=1)
+    for key in (*middle.T, radius):
+        quarters = np.array_split(np.argsort(key), _QUARTERS)
+        yield from (np.setdiff1d(np.arange(len(key)), quarter) for quarter in quarters)
 
 
 def _without_late(
@@ -219,10 +275,14 @@ def _stretch(found: Sequence[tuple[TrackWindow, _System]]) -> Float64:
     return np.asarray(np.einsum("kpi,ki->p", moved, path_m / lengths_m[:, None]) / lengths_m.sum())
 
 
-def _seen(window: TrackWindow, part: StereoTracks, places: Places) -> TrackWindow:
-    """Return a window with the features where they are without the fault."""
+def _corrected(
+    part: StereoTracks, window: TrackWindow, fault: RigFault, values: Float64
+) -> tuple[Places, TrackWindow]:
+    """Return where features are without the fault, and a window with them there."""
+    places = fault.correct(part.window.uvd[..., :2], part.right_uv, values[:-1])
+    places = _in_time(places, window, fault.camera, values[-1])
     disparity = places.left_uv[..., :1] - places.right_uv[..., :1]
-    return replace(window, uvd=np.concatenate([places.left_uv, disparity], axis=2))
+    return places, replace(window, uvd=np.concatenate([places.left_uv, disparity], axis=2))
 
 
 class _System(NamedTuple):

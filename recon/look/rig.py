@@ -49,6 +49,10 @@ MOST_DEPTH_PERCENT: Final = 2.0
 LEAST_FRAMES: Final = MIN_WINDOWS * FRAMES  # of a drive whose rig is refined
 MOST_LATE: Final = 0.1  # frames from which right images are said to be late
 LATER: Final = "after the left ones"  # in what is said of them
+_TURNING: Final = (
+    "what is wrong with the rig turns with what is seen, as in stabilised images, which no "
+    "calibration mends: no more is corrected than rows need; record images as sensors see them"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +118,9 @@ class RefinedRig:
         by, squares = self.fitted.stretch, self.fitted.covariance
         kept = 0.0 if self.refined else float(by @ self.fitted.values)
         wider = self.baseline.sigma if self.baseline is not None and self.baseline.share else 0.0
-        return float(np.sqrt(by @ squares @ by + kept**2 + wider**2))
+        # What misleads the rig misleads the path alike, which has nothing of what the rig takes up.
+        own = float(by @ squares @ by) - self.fitted.alike**2
+        return float(np.sqrt(max(own, 0.0) + kept**2 + wider**2))
 
     def applied(self, source: StereoSource) -> StereoSource:
         """Return the drive with the refined rig, marked if its cameras are not rigid."""
@@ -240,6 +246,8 @@ class RefinedRig:
         late = f"right images are taken {self.late} {LATER}: what moves is seen at a wrong depth, "
         late += "which no calibration mends; trigger both cameras together"
         lines = [late] if self.late and not any(LATER in line for line in known) else []
+        if self.fitted is not None and not self.fitted.fixed:
+            lines.append(_TURNING)
         if self.baseline is not None and self.baseline.share:
             lines.append(self.baseline.describe(used=self.refined))
         if not self.wrong_at(DEPTHS_M[0]):
@@ -297,7 +305,7 @@ def refine(
     """
     values = np.zeros(len(NAMES)) if known is None else known.fitted.values.copy()
     values[: len(TURN)] += seen.turn
-    refined, tracks, spread = seen.rig, seen.tracks, 1.0
+    refined, tracks = seen.rig, seen.tracks
     # A rig that has turned since is not as it was known.
     before = None if known is None or seen.turn.any() else known.fitted
     for left in reversed(range(_PASSES)):
@@ -305,8 +313,8 @@ def refine(
             return begun
         last, turns = refined, turns_of(refined, config.rectification)
         stage("fit the rig")
-        fitted = fit_fault(tracks, RigFault(turns.camera), active(last), before, spread)
-        values, spread = values + fitted.values, fitted.spread
+        fitted = fit_fault(tracks, RigFault(turns.camera), active(last), before, values)
+        values = values + fitted.values
         refined, before = without_fault(last, turns, fitted.values), None
         change = compare_rigs(last, refined, DEPTHS_M[-1], config.rectification)
         if change.moved_px < _FAR_OFF_PX or not left:

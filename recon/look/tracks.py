@@ -7,9 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.values import Recorded, Rectified, RectifiedCamera
 from recon.core.values.arrays import Float64
+from recon.look.fault import RigFault
 from recon.odometry.features import find_in_right, surface_slopes
 from recon.odometry.pose import TrackWindow
 from recon.odometry.protocol import OdometryFrame, OdometryResult
@@ -34,9 +36,13 @@ class StereoTracks:
 
     def thinned(self, every: int) -> StereoTracks:
         """Return every so many-th of the tracks."""
-        window, chosen = self.window, np.arange(0, len(self.window.xyz_world), every)
-        fewer = replace(window, uvd=window.uvd[:, chosen], xyz_world=window.xyz_world[chosen])
-        return StereoTracks(fewer, self.right_uv[:, chosen])
+        return self.chosen(np.arange(0, len(self.window.xyz_world), every))
+
+    def chosen(self, at: NDArray[np.int64]) -> StereoTracks:
+        """Return some of the tracks."""
+        window = self.window
+        fewer = replace(window, uvd=window.uvd[:, at], xyz_world=window.xyz_world[at])
+        return StereoTracks(fewer, self.right_uv[:, at])
 
 
 def tracked_parts(frames: int) -> list[tuple[int, int]]:
@@ -137,3 +143,28 @@ def _in_right(window: TrackWindow, frames: Sequence[OdometryFrame]) -> Float64:
         uv, d = window.uvd[k, seen, :2], window.uvd[k, seen, 2]
         right_uv[k, seen] = find_in_right(frame.pair, uv, d, surface_slopes(frame.disparity, uv))
     return right_uv
+
+
+def turns(part: StereoTracks, fault: RigFault, values: Float64) -> bool:
+    """Return whether rows along tracks are as if a fault (P,) turned with what is seen.
+
+    Of a rig it stays where it is in its images: a feature that moves there has another part of it.
+    """
+    camera, poses = fault.camera, part.window.T_world_camera
+    seen = (part.window.uvd[..., :2], part.right_uv)
+    turned = (poses[0, :3, :3].T @ poses[:, :3, :3]).transpose(0, 2, 1)
+
+    def at_first(uv: Float64, cx_px: float) -> Float64:
+        xy = (uv - [cx_px, camera.cy_px]) / camera.focal_px
+        rays = xy @ turned[:, :2] + turned[:, 2:]
+        return np.asarray(camera.focal_px * rays[..., :2] / rays[..., 2:] + [cx_px, camera.cy_px])
+
+    def varied_px(left_uv: Float64, right_uv: Float64) -> float:
+        places = fault.correct(left_uv, right_uv, values)
+        moved = places.right_uv - right_uv - places.left_uv + left_uv
+        rows = (seen[1] - seen[0] + moved)[..., 1]
+        rows = rows[:, np.isfinite(rows).any(axis=0)]
+        return float(np.nansum(np.abs(rows - np.nanmedian(rows, axis=0))))
+
+    turning = at_first(seen[0], camera.cx_px), at_first(seen[1], camera.cx_right_px)
+    return varied_px(*turning) < varied_px(*seen)
