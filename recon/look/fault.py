@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Bool, Float64
@@ -45,6 +46,11 @@ class Places:
     right_uv: Float64
     by_left: Float64  # (…, 2, P)
     by_right: Float64
+
+    def chosen(self, at: NDArray[np.int64]) -> Places:
+        """Return those of some of the features (frames, features, 2) of a window."""
+        parts = (self.left_uv, self.right_uv, self.by_left, self.by_right)
+        return Places(*(part[:, at] for part in parts))
 
 
 @dataclass(frozen=True, eq=False)

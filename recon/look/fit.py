@@ -18,6 +18,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
 from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.look.fault import Places, RigFault, shrink
+from recon.look.halves import disagreement
 from recon.look.tracks import StereoTracks, turns
 from recon.odometry.kernels import bundle
 from recon.odometry.pose import (
@@ -60,7 +61,8 @@ class FittedFault:
     late_sigma: float = float("nan")
     spread: float = 1.0  # variance of what lenses bend, in that expected beforehand, 1 or more
     fixed: bool = True  # False: it turns with the images, as those of a stabilised video do
-    alike: float = 0.0  # standard deviation of the path's length by features that lie alike, share
+    # standard deviation of the path's length without the fault, as a share; NaN = as the covariance
+    length: float = float("nan")
 
 
 def fit_fault(
@@ -90,7 +92,7 @@ def fit_fault(
     covariance of clustered data); Efron, "The jackknife, the bootstrap and other resampling plans",
     1982.
     """
-    active = np.append(active, True)
+    active, camera = np.append(active, True), fault.camera
     sigmas = np.append(fault.sigmas, _LATE_SIGMA)[active]
     prior, scatter = np.diag(1.0 / sigmas**2), 1.0
     values, windows = np.zeros(len(active)), [part.window for part in tracks]
@@ -99,8 +101,8 @@ def fit_fault(
 
     def linearised(part: StereoTracks, window: TrackWindow) -> tuple[TrackWindow, _System]:
         places, window = _corrected(part, window, fault, values)
-        window = adjust(window, fault.camera)
-        return window, _system(window, places, fault.camera)
+        window = adjust(window, camera)
+        return window, _system(window, places, camera)
 
     for parts in (few, tracks):
         # As they were moved by the parts before.
@@ -139,14 +141,18 @@ def fit_fault(
     own, shown, late, sigma = _without_late(values[active], shown, sigmas)
     moved = None if moved is None else moved[rig]
     values[:-1][rig], squares, spread = shrink(own, shown, sigmas[:-1], moved)
-    covariance[np.ix_(rig, rig)] = squares + off[:-1, :-1]
+    covariance[np.ix_(rig, rig)], stretch = squares, _stretch(found)[:-1]
     fixed = not all(turns(part, fault, values[:-1]) for part in tracks)
     if not fixed:
         covariance += np.outer(values[:-1], values[:-1])
         values[:-1] = 0.0
-    stretch = _stretch(found)[:-1]
-    alike = float(np.sqrt(stretch[rig] @ off[:-1, :-1] @ stretch[rig]))
-    others = (late, sigma, spread, fixed, alike)
+    # What misleads the rig misleads the path alike: of its length, its own features tell. In it
+    # nothing is corrected of late images.
+    used = np.append(values[:-1], 0.0)
+    apart = disagreement([_corrected(part, part.window, fault, used)[1] for part in parts], camera)
+    length = float(np.sqrt(stretch @ covariance @ stretch + apart**2))
+    covariance[np.ix_(rig, rig)] += off[:-1, :-1]
+    others = (late, sigma, spread, fixed, length)
     return FittedFault(values[:-1], covariance, stretch, scatter, len(tracks), *others)
 
 
@@ -160,10 +166,10 @@ def _by_likeness(
 
     def left(part: StereoTracks) -> tuple[Float64, Float64]:
         part, found = part.thinned(every := max(1, part.right_uv.shape[1] // _ENOUGH)), []
+        places, window = _corrected(part, part.window, fault, values)
         for at in _without_quarters(part.window, fault.camera):
-            fewer = part.chosen(at)
-            places, window = _corrected(fewer, fewer.window, fault, values)
-            found.append(_system(window, places, fault.camera))
+            fewer = replace(window, uvd=window.uvd[:, at], xyz_world=window.xyz_world[at])
+            found.append(_system(fewer, places.chosen(at), fault.camera))
         times = every * _QUARTERS / (_QUARTERS - 1)
         H, g, _ = (times * np.stack(terms) for terms in zip(*found, strict=True))
         return H[:, active][:, :, active], g[:, active] + H[:, active] @ values

@@ -115,12 +115,12 @@ class RefinedRig:
         """
         if self.fitted is None:
             return None
-        by, squares = self.fitted.stretch, self.fitted.covariance
+        by, own = self.fitted.stretch, self.fitted.length
+        if np.isnan(own):  # fitted by an earlier version
+            own = float(np.sqrt(by @ self.fitted.covariance @ by))
         kept = 0.0 if self.refined else float(by @ self.fitted.values)
         wider = self.baseline.sigma if self.baseline is not None and self.baseline.share else 0.0
-        # What misleads the rig misleads the path alike, which has nothing of what the rig takes up.
-        own = float(by @ squares @ by) - self.fitted.alike**2
-        return float(np.sqrt(max(own, 0.0) + kept**2 + wider**2))
+        return float(np.sqrt(own**2 + kept**2 + wider**2))
 
     def applied(self, source: StereoSource) -> StereoSource:
         """Return the drive with the refined rig, marked if its cameras are not rigid."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.values import Recorded, Rectified, RectifiedCamera
 from recon.core.values.arrays import Float64
@@ -36,13 +35,9 @@ class StereoTracks:
 
     def thinned(self, every: int) -> StereoTracks:
         """Return every so many-th of the tracks."""
-        return self.chosen(np.arange(0, len(self.window.xyz_world), every))
-
-    def chosen(self, at: NDArray[np.int64]) -> StereoTracks:
-        """Return some of the tracks."""
-        window = self.window
-        fewer = replace(window, uvd=window.uvd[:, at], xyz_world=window.xyz_world[at])
-        return StereoTracks(fewer, self.right_uv[:, at])
+        window, chosen = self.window, np.arange(0, len(self.window.xyz_world), every)
+        fewer = replace(window, uvd=window.uvd[:, chosen], xyz_world=window.xyz_world[chosen])
+        return StereoTracks(fewer, self.right_uv[:, chosen])
 
 
 def tracked_parts(frames: int) -> list[tuple[int, int]]:

@@ -309,7 +309,8 @@ def test_features_that_lie_alike_and_err_alike_make_intervals_wider():
     found = fit_fault([spoiled(k) for k in range(WINDOWS)], FAULT, ALL)
     # Windows agree: all are wrong in the same way.
     assert found.scatter < 1.5
-    assert found.alike > 1.5 * clean.alike
+    # So are halves of their features, which do not.
+    assert found.length > 1.3 * clean.length
     assert off_squares(found).mean() > 1.5 * off_squares(clean).mean()
     assert np.mean(off_px(NONE, found.values)[:, 1] ** 2 < 1.96**2 * off_squares(found)) > 0.95
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.core.geometry.se3 import apply, make_transform
+from recon.core.geometry.se3 import make_transform
 from recon.core.values import RectifiedCamera
 from recon.core.values.camera import project
 from recon.look.halves import disagreement
