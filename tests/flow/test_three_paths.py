@@ -146,7 +146,8 @@ def test_tables_have_the_truths_share_beside_drift(three, monkeypatch):
         assert shares == {f"{share:.2f} %"}
     assert sum("three_paths.py" in line for line in ran) == 6  # of three drives and two rigs, once
     rows = results.rows_of(results.TABLES["three-paths"], {"street, refined (x), truth": truth})
-    assert rows["street, refined, 5 m"]["segments"] == truth["as it is"]["5"]["segments"]
+    assert rows["street, refined, 10 m"]["segments"] == truth["as it is"]["10"]["segments"]
+    assert "street, refined, 5 m" not in rows
     assert rows["street, refined, 50 m, rotation"]["truth"].endswith("°/100 m")
 
 
