@@ -23,6 +23,7 @@ _LEAST_MOTION: Final = 0.1  # in baselines; a window that moves less shows no de
 _LEAST_SEEN: Final = 3  # frames that a point is seen in; what is seen less checks hardly anything
 TRACKED: Final = 72  # frames to track features through in all
 REACH: Final = 600  # frames from the start that they are among: a video is decoded up to each
+_ODDS: Final = 20.0  # with which rows of a window tell that a fault turns with what is seen
 _PARTS: Final = 6  # of the drive that they are from, two windows in each
 
 
@@ -144,6 +145,7 @@ def turns(part: StereoTracks, fault: RigFault, values: Float64) -> bool:
     """Return whether rows along tracks are as if a fault (P,) turned with what is seen.
 
     Of a rig it stays where it is in its images: a feature that moves there has another part of it.
+    Where the camera hardly turns both are alike, and nothing is said (errors of rows as Laplace's).
     """
     camera, poses = fault.camera, part.window.T_world_camera
     seen = (part.window.uvd[..., :2], part.right_uv)
@@ -162,4 +164,6 @@ def turns(part: StereoTracks, fault: RigFault, values: Float64) -> bool:
         return float(np.nansum(np.abs(rows - np.nanmedian(rows, axis=0))))
 
     turning = at_first(seen[0], camera.cx_px), at_first(seen[1], camera.cx_right_px)
-    return varied_px(*turning) < varied_px(*seen)
+    found = np.isfinite(part.right_uv[..., 1])
+    told = max(1, int(found.sum() - found.any(axis=0).sum()))  # each track has its own median
+    return varied_px(*turning) * _ODDS ** (1.0 / told) < varied_px(*seen)

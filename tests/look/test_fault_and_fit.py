@@ -13,7 +13,7 @@ from recon.core.values.camera import project
 from recon.look.fault import LENS, NAMES, RigFault, active, may_bend, shrink, without_fault
 from recon.look.fit import FittedFault, fit_fault
 from recon.look.rig import compare_rigs
-from recon.look.tracks import StereoTracks
+from recon.look.tracks import StereoTracks, turns
 from recon.odometry.pose import TrackWindow, adjust
 from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
 
@@ -290,6 +290,20 @@ def test_a_fault_that_turns_with_what_is_seen_is_none_of_the_rig():
     assert np.sqrt(squares.mean()) > 0.5 * rms(off_px(values, NONE))[1]
     nothing = fit_fault([warped(tracks(NONE, k)) for k in range(WINDOWS)], FAULT, ALL)
     assert rms(off_px(NONE, nothing.values)).max() < 0.05
+
+
+@pytest.mark.parametrize("drive", [2, 5])
+def test_on_a_straight_road_chance_does_not_tell_that_a_fault_turns(drive: int, monkeypatch):
+    """Noise that tilts the poses of a window makes rows vary less, by next to nothing."""
+    monkeypatch.setitem(globals(), "step", lambda m: make_transform(np.eye(3), np.array([0, 0, m])))
+    values = fault(zoom=-1e-3)
+    windows = [tracks(values, 1000 * drive + k) for k in range(WINDOWS)]
+    # Poses as odometry finds them, not the true ones.
+    windows = [replace(part, window=adjust(part.window, CAMERA)) for part in windows]
+    found = fit_fault(windows, FAULT, ALL)
+    assert found.fixed
+    assert rms(off_px(values, found.values))[0] < 0.05
+    assert not any(turns(part, FAULT, NONE) for part in windows)
 
 
 def off_squares(found: FittedFault) -> np.ndarray:
