@@ -339,7 +339,7 @@ def _of_rows(places: Places) -> tuple[Float64, Float64]:
     residual = np.nan_to_num(error) / _ROW_SIGMA_PX
     weight = np.isfinite(error) / (1.0 + (residual / CAUCHY_SIGMAS) ** 2)
     by = np.nan_to_num(places.by_right[:, :, 1] - places.by_left[:, :, 1]) / _ROW_SIGMA_PX
-    J = by.reshape(residual.size, -1)
+    J = by.reshape(residual.size, by.shape[-1])
     weighed = weight.reshape(-1, 1) * J
     # A correction moves the observed row: it is to take the error away.
     return weighed.T @ J, -weighed.T @ residual.ravel()
@@ -360,9 +360,9 @@ def _of_places(window: TrackWindow, places: Places, camera: RectifiedCamera) -> 
     by_pose = np.concatenate([-by_place, np.cross(by_place, xyz[:, :, None])], axis=3)
     by_point = by_place @ T_camera_world[:, None, :3, :3]
     weighed = weight[:, :, None, None] * J
-    flat = weighed.reshape(frames, 3 * points, -1)
-    whole = flat.reshape(3 * frames * points, -1)
-    by_track = weighed.transpose(1, 3, 0, 2).reshape(points, -1, 3 * frames)
+    flat = weighed.reshape(frames, 3 * points, J.shape[-1])
+    whole = flat.reshape(3 * frames * points, J.shape[-1])
+    by_track = weighed.transpose(1, 3, 0, 2).reshape(points, J.shape[-1], 3 * frames)
     return _Shared(
         H=whole.T @ J.reshape(whole.shape),
         g=whole.T @ residual.ravel(),

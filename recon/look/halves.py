@@ -28,8 +28,8 @@ def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> flo
     """
 
     def measured(window: TrackWindow) -> tuple[float, Float64] | None:
-        halves = list(_halves(window))
-        if min(int(half.sum()) for half in halves) < MIN_INLIERS:
+        halves = list(_halves(window)) if len(window.xyz_world) else []
+        if min((int(half.sum()) for half in halves), default=0) < MIN_INLIERS:
             return None
         apart_m = [_length_m(window, half, camera) - _length_m(window, ~half, camera)
                    for half in halves]  # fmt: skip

@@ -329,6 +329,16 @@ def test_features_that_lie_alike_and_err_alike_make_intervals_wider():
     assert np.mean(off_px(NONE, found.values)[:, 1] ** 2 < 1.96**2 * off_squares(found)) > 0.95
 
 
+@pytest.mark.parametrize("points", [0, 1, 3])
+def test_of_windows_with_hardly_a_feature_nothing_fails(points: int):
+    whole = [tracks(NONE, k) for k in range(WINDOWS)]
+    window, right_uv = whole[0].window, whole[0].right_uv[:, :points]
+    few = TrackWindow(window.T_world_camera, window.uvd[:, :points], window.xyz_world[:points])
+    found = fit_fault([StereoTracks(few, right_uv), *whole[1:]], FAULT, ALL)
+    assert found.fixed
+    assert rms(off_px(NONE, found.values)).max() < 0.05
+
+
 @pytest.mark.parametrize("values", [fault(yaw=2e-4), fault(zoom=-5e-4), 0.1 * LENSES])
 def test_a_path_becomes_longer_with_a_fault_as_is_said(values):
     windows = [tracks(values, k) for k in range(WINDOWS)]
