@@ -104,6 +104,8 @@ class Altered(StereoSource):
 
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
+    if options.peer is not None and not options.peer.is_dir():
+        raise SystemExit(f"altered_drives: {options.peer} is no folder of poses")
     rendered = demo_source(load_config(None, options.set))
     drive = rendered if options.drive is None else open_source(options.drive)
     cases = alterations(drive)

@@ -30,9 +30,10 @@ from corners import COMPONENTS, LEAST_INDEPENDENT, Split, differences, independe
 from result_drift_rows import cell_of
 
 from recon.commands.config import ReconConfig, load_config
-from recon.core.errors import ReconError
+from recon.core.errors import EvaluationError, ReconError
+from recon.core.text import metres
 from recon.core.values import Trajectory
-from recon.evaluation.trajectory import Segments, choose_segments, segments_of
+from recon.evaluation.trajectory import MIN_PATH_M, Segments, choose_segments, segments_of
 from recon.io.trajectory import read_kitti_poses
 from recon.look.look import refine_rig
 from recon.odometry.registry import make_odometry
@@ -120,6 +121,8 @@ def paths_of(
 def compared(paths: Mapping[str, Trajectory]) -> Found:
     """The errors of each path, by length of segment (metres) and for the segments of ``t_rel``."""
     truth = next(iter(paths.values()))
+    if truth.path_length_m < MIN_PATH_M:
+        raise EvaluationError("true path is too short", got=metres(truth.path_length_m))
     lengths = {f"{m:g}": segments_of(truth.distances_m, (m,), 1) for m in LENGTHS_M}
     lengths = {m: segments for m, segments in lengths.items() if len(segments.first)}
     return {

@@ -1,6 +1,7 @@
 """Errors of paths by how they differ: recovered where independent, doubted where they are not."""
 
 import json
+import sys
 from functools import cache
 from itertools import product
 from types import SimpleNamespace
@@ -195,10 +196,16 @@ def test_what_cannot_be_compared_is_refused_in_a_line(three, street, tmp_path):
     bare = street_drive(tmp_path / "bare", 3)
     (bare / "poses.txt").unlink()
     refused(three, [bare, *peers], "has no true poses")
+    standing = street_drive(tmp_path / "standing", 3, speed_m_per_frame=0.0)
+    (tmp_path / "orbslam3" / standing.name).mkdir(exist_ok=True)
+    write_kitti_poses(tmp_path / "orbslam3" / standing.name / "as_it_is.txt", exact(3))
+    refused(three, [standing, *peers], "true path is too short (got 0")
+    file = tmp_path / "orbslam3" / street.name / "as_it_is.txt"
+    refused(sys.modules["altered_drives"], [street, "--peer", file], "is no folder of poses")
 
 
-def refused(three, words: list, expected: str) -> None:
+def refused(benchmark, words: list, expected: str) -> None:
     with pytest.raises(SystemExit) as end:
-        three.main([str(word) for word in words])
+        benchmark.main([str(word) for word in words])
     assert expected in str(end.value.code)
     assert "\n" not in str(end.value.code)
