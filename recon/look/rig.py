@@ -50,8 +50,9 @@ LEAST_FRAMES: Final = MIN_WINDOWS * FRAMES  # of a drive whose rig is refined
 MOST_LATE: Final = 0.1  # frames from which right images are said to be late
 LATER: Final = "after the left ones"  # in what is said of them
 _TURNING: Final = (
-    "what is wrong with the rig turns with what is seen, as in stabilised images, which no "
-    "calibration mends: no more is corrected than rows need; record images as sensors see them"
+    "what is wrong with the rig moves with what is seen instead of staying in the image, as in "
+    "stabilised images: no calibration mends that, so at most rows are aligned, and depth and the "
+    "length of the path stay off; record images as sensors see them"
 )
 
 
@@ -206,6 +207,7 @@ class RefinedRig:
             "refined": self.refined,
             "begun_with": self.begun_with,
             "windows": self.fitted.windows,
+            "fixed": self.fitted.fixed,
             **{f"{n}_deg": float(np.degrees(x)) for n, x in zip(TURN[:3], values, strict=False)},
             "focal_percent": -100.0 * float(values[3]),
             "disparity_px": {
@@ -280,7 +282,7 @@ class KnownRig:
     def begun(self, settings: RectificationSettings) -> RefinedRig:
         """Return what another drive of the rig begins with, whose cameras run anew."""
         rig, none = self.described(settings), float("nan")
-        fitted = replace(self.fitted, late=none, late_sigma=none)
+        fitted = replace(self.fitted, late=none, late_sigma=none, fixed=True)
         return replace(rig, fitted=fitted, begun_with=self.name)
 
 

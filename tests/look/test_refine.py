@@ -139,6 +139,16 @@ def test_cameras_that_are_not_in_step_do_not_look_turned():
     assert rig.warnings([line]) == [one for one in rig.warnings() if one != line]
 
 
+def test_stabilised_images_are_said_of_the_drive_that_has_them(street):
+    rig = refine_rig(street, CONFIG, AUTO)
+    rig = replace(rig, fitted=replace(rig.fitted, fixed=False))
+    (line,) = rig.warnings()
+    assert "stabilised" in line
+    assert rig.figures()["fixed"] is False
+    known = KnownRig(rig.given, rig.calibration, rig.fitted, "first")
+    assert known.begun(CONFIG.rectification).warnings() == []
+
+
 @pytest.mark.parametrize(
     ("short", "live", "refine"),
     [(True, False, True), (False, True, True), (True, False, False)],
