@@ -137,9 +137,10 @@ def _known(figures: Mapping[str, Any], text: str) -> str:
 def _by_motion(found: Mapping[str, Any]) -> str:
     off, depths = found["disparity_px"], found["depth_percent"].items()
     far = ", ".join(f"{_depth_off(x)} at {z} m" for z, x in depths)
+    moves = "" if found["fixed"] else "; moves with what is seen, as in stabilised images"
     return (
         f"disparities {off['mean']:+.2f} ± {1.96 * off['sigma']:.2f} px off, {off['rms']:.2f} px "
-        f"rms over the image (depth {far}); {_turned(found)}; the baseline cannot be seen"
+        f"rms over the image (depth {far}); {_turned(found)}{moves}; the baseline cannot be seen"
     )
 
 

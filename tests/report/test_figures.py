@@ -445,6 +445,10 @@ def test_lines_of_an_audit_say_what_is_not_known():
     turn = {"pitch_deg": 0.1, "yaw_deg": -0.2, "roll_deg": 0.0, "focal_percent": 0.25}
     lines = audit_page.audit_lines(summary | {"mended": {**turn, "files": ["new.yaml"]}})
     assert re.match(r"new.yaml.* \+0.100 deg pitch, -0.200 deg yaw", lines["mended"])
+    off = {"disparity_px": {"mean": 0.0, "sigma": 0.1, "rms": 0.1}, "depth_percent": {}}
+    for fixed in (True, False):
+        lines = audit_page.audit_lines(summary | {"rig_by_motion": {**turn, **off, "fixed": fixed}})
+        assert ("as in stabilised images" in lines["by its motion"]) is not fixed
 
 
 @pytest.mark.parametrize(("off_px", "limit"), [(-2.0, 2.0), (0.01, 0.1), (math.nan, 0.1)])
