@@ -166,4 +166,4 @@ def turns(part: StereoTracks, fault: RigFault, values: Float64) -> bool:
     turning = at_first(seen[0], camera.cx_px), at_first(seen[1], camera.cx_right_px)
     found = np.isfinite(part.right_uv[..., 1])
     told = max(1, int(found.sum() - found.any(axis=0).sum()))  # each track has its own median
-    return varied_px(*turning) * _ODDS ** (1.0 / told) < varied_px(*seen)
+    return bool(varied_px(*turning) * _ODDS ** (1.0 / told) < varied_px(*seen))
