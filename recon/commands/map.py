@@ -55,7 +55,9 @@ from recon.run.run import Run
 from recon.sources.calibration import RIG_FILE
 from recon.sources.source import StereoSource, check_source
 
-_SAID: Final = frozenset({"rig", "nonrigid", "lag"})  # findings that a run says anyway
+_SAID: Final = frozenset(
+    {"rig", "nonrigid", "stabilised", "lag"}
+)  # findings that a run says anyway
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.look.look import Look
 from recon.look.measures import MIN_FEATURES, Gaps
-from recon.look.rig import LATER, MOST_LATE, RefinedRig
+from recon.look.rig import LATER, MOST_LATE, MOVES, RefinedRig
 from recon.look.sample import BLANK_DN, Sample
 from recon.look.settings import AuditedSettings
 from recon.stereo.match.protocol import Matcher
@@ -59,6 +59,7 @@ _TEXTS: Final = {
     "skew": f"the right images are taken {{skew:+.2f}} frames {LATER}; trigger both cameras "
     "together, or drive slowly",
     "nonrigid": "{found}",
+    "stabilised": "{found}",
     "features": "too few features match between left and right ({matched} matched) to check the "
     "geometry: the images show too little texture, or different scenes",
     "rows": "rows of left and right are not aligned: {rows.rms_px:.2f} px rms, mean "
@@ -190,6 +191,8 @@ def _of_geometry(look: Look) -> Found:
 
 def _of_rig(rig: RefinedRig, disparity_px: Float64) -> Found:
     """Yield a rig with which depth is off where most of what it sees is."""
+    if rig.fitted is not None and not rig.fitted.fixed:
+        yield "stabilised", {"found": MOVES}
     if not rig.changes or not len(disparity_px):
         return
     working_m = (

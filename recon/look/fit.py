@@ -142,7 +142,7 @@ def fit_fault(
     moved = None if moved is None else moved[rig]
     values[:-1][rig], squares, spread = shrink(own, shown, sigmas[:-1], moved)
     covariance[np.ix_(rig, rig)], stretch = squares, _stretch(found)[:-1]
-    fixed = not all(turns(part, fault, values[:-1]) for part in tracks)
+    fixed = not turns(tracks, fault, values[:-1])
     if not fixed:
         covariance += np.outer(values[:-1], values[:-1])
         values[:-1] = 0.0

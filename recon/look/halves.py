@@ -24,7 +24,7 @@ def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> flo
 
     That of the halves that disagree most: what is near is low, too, so that theirs do not add up.
     ``windows`` are seen with the rig of the path; those with too few features to be halved do not
-    count, and 0.0 is returned where there are no others.
+    count. NaN = there are no others.
     """
 
     def measured(window: TrackWindow) -> tuple[float, Float64] | None:
@@ -40,7 +40,7 @@ def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> flo
     with serial_algebra():
         found = [one for one in side_by_side(measured, windows, threads=FEW) if one is not None]
     if not found:
-        return 0.0
+        return float("nan")
     apart = sum(apart_m for _, apart_m in found) / sum(length_m for length_m, _ in found)
     return 0.5 * float(np.abs(apart).max())
 

@@ -49,7 +49,7 @@ MOST_DEPTH_PERCENT: Final = 2.0
 LEAST_FRAMES: Final = MIN_WINDOWS * FRAMES  # of a drive whose rig is refined
 MOST_LATE: Final = 0.1  # frames from which right images are said to be late
 LATER: Final = "after the left ones"  # in what is said of them
-_TURNING: Final = (
+MOVES: Final = (
     "what is wrong with the rig moves with what is seen instead of staying in the image, as in "
     "stabilised images: no calibration mends that, so at most rows are aligned, and depth and the "
     "length of the path stay off; record images as sensors see them"
@@ -249,7 +249,7 @@ class RefinedRig:
         late += "which no calibration mends; trigger both cameras together"
         lines = [late] if self.late and not any(LATER in line for line in known) else []
         if self.fitted is not None and not self.fitted.fixed:
-            lines.append(_TURNING)
+            lines.append(MOVES)
         if self.baseline is not None and self.baseline.share:
             lines.append(self.baseline.describe(used=self.refined))
         if not self.wrong_at(DEPTHS_M[0]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -23,7 +24,7 @@ _LEAST_MOTION: Final = 0.1  # in baselines; a window that moves less shows no de
 _LEAST_SEEN: Final = 3  # frames that a point is seen in; what is seen less checks hardly anything
 TRACKED: Final = 72  # frames to track features through in all
 REACH: Final = 600  # frames from the start that they are among: a video is decoded up to each
-_ODDS: Final = 20.0  # with which rows of a window tell that a fault turns with what is seen
+_ODDS: Final = 20.0  # of each window, on average, that a fault turns with what is seen
 _PARTS: Final = 6  # of the drive that they are from, two windows in each
 
 
@@ -141,12 +142,18 @@ def _in_right(window: TrackWindow, frames: Sequence[OdometryFrame]) -> Float64:
     return right_uv
 
 
-def turns(part: StereoTracks, fault: RigFault, values: Float64) -> bool:
+def turns(tracks: Sequence[StereoTracks], fault: RigFault, values: Float64) -> bool:
     """Return whether rows along tracks are as if a fault (P,) turned with what is seen.
 
     Of a rig it stays where it is in its images: a feature that moves there has another part of it.
-    Where the camera hardly turns both are alike, and nothing is said (errors of rows as Laplace's).
+    Where the camera hardly turns both are alike, and nothing is said.
     """
+    told = sum(_turns(part, fault, values) for part in tracks)
+    return told > len(tracks) * math.log(_ODDS)
+
+
+def _turns(part: StereoTracks, fault: RigFault, values: Float64) -> float:
+    """Return the logarithm of the odds of one window, of errors of rows as Laplace's."""
     camera, poses = fault.camera, part.window.T_world_camera
     seen = (part.window.uvd[..., :2], part.right_uv)
     turned = (poses[0, :3, :3].T @ poses[:, :3, :3]).transpose(0, 2, 1)
@@ -166,4 +173,5 @@ def turns(part: StereoTracks, fault: RigFault, values: Float64) -> bool:
     turning = at_first(seen[0], camera.cx_px), at_first(seen[1], camera.cx_right_px)
     found = np.isfinite(part.right_uv[..., 1])
     told = max(1, int(found.sum() - found.any(axis=0).sum()))  # each track has its own median
-    return bool(varied_px(*turning) * _ODDS ** (1.0 / told) < varied_px(*seen))
+    varied = varied_px(*turning), varied_px(*seen)
+    return told * math.log(varied[1] / varied[0]) if min(varied) > 0.0 else 0.0

@@ -36,7 +36,9 @@ _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 # walls, exceed 40 %. It is also warned of where more was inferred than measured.
 _FEW_MEASURED_SHARE: Final = 0.25
 # Findings with which rows and motion say nothing about the calibration.
-_NOT_OF_THE_RIG: Final = frozenset({"lag", "nonrigid", "swapped", "size", "frozen", "unreadable"})
+_NOT_OF_THE_RIG: Final = frozenset(
+    {"lag", "nonrigid", "stabilised", "swapped", "size", "frozen", "unreadable"}
+)
 _TURNED: Final = ("pitch_deg", "yaw_deg", "roll_deg", "focal_percent")
 _LEAST_SIGMA_PX: Final = 0.05  # no matcher is more accurate on real images
 

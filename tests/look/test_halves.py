@@ -67,6 +67,6 @@ def test_where_all_are_right_or_off_alike_halves_agree():
 
 def test_windows_with_few_features_say_nothing():
     few = [seen(24, seed) for seed in range(6)]
-    assert disagreement(few, CAMERA) == 0.0
+    assert np.isnan(disagreement(few, CAMERA))
     many = windows(0.02, lambda w: w.uvd[0, :, 0] > CAMERA.cx_px)
     assert disagreement([*few, *many], CAMERA) == disagreement(many, CAMERA)

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
+from recon.core.errors import CalibrationError
 from recon.core.values import StereoPair
 from recon.io.cameras.calibration import read_calibration
+from recon.look.findings import find_faults
+from recon.look.look import look_at
 from recon.rig.audit import audit_source, correct_calibration
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
@@ -117,6 +120,18 @@ def test_a_rig_that_is_not_rectified_is_corrected_too(street, tmp_path):
 def longer_street():
     """A drive long enough for its motion to show the rig."""
     return rendered(3, 48)
+
+
+def test_images_that_are_stabilised_show_no_rig(longer_street, tmp_path):
+    look = look_at(longer_street, CONFIG)
+    assert look.rig.fitted.fixed
+    rig = replace(look.rig, fitted=replace(look.rig.fitted, fixed=False))
+    found = find_faults(replace(look, rig=rig), CONFIG)
+    assert [(one.code, one.fatal) for one in found] == [("stabilised", False)]
+    audit = replace(audit_source(longer_street, CONFIG), findings=found)
+    with pytest.raises(CalibrationError, match="moves with what is seen"):
+        correct_calibration(longer_street, CONFIG, audit, tmp_path / "mended.yaml")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
