@@ -55,9 +55,8 @@ from recon.run.run import Run
 from recon.sources.calibration import RIG_FILE
 from recon.sources.source import StereoSource, check_source
 
-_SAID: Final = frozenset(
-    {"rig", "nonrigid", "stabilised", "lag"}
-)  # findings that a run says anyway
+# Findings that a run says anyway.
+_SAID: Final = frozenset({"rig", "nonrigid", "stabilised", "lag"})
 
 
 @dataclass(frozen=True, eq=False)

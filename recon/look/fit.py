@@ -18,7 +18,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
 from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.look.fault import Places, RigFault, shrink
-from recon.look.halves import disagreement
+from recon.look.halves import disagreement, middles
 from recon.look.tracks import StereoTracks, turns
 from recon.odometry.kernels import bundle
 from recon.odometry.pose import (
@@ -60,7 +60,7 @@ class FittedFault:
     late: float = 0.0  # frames by which right images are taken later than left ones
     late_sigma: float = float("nan")
     spread: float = 1.0  # variance of what lenses bend, in that expected beforehand, 1 or more
-    fixed: bool = True  # False: it turns with the images, as those of a stabilised video do
+    fixed: bool = True  # False: it turns with what is seen, as in stabilised images
     # standard deviation of the path's length without the fault, as a share; NaN = as the covariance
     length: float = float("nan")
 
@@ -85,7 +85,7 @@ def fit_fault(
     features let expect, what they know counts less; and so it does by how much it depends on where
     features lie, since those that lie alike err alike in all windows.
 
-    What is wrong with a rig is so at places of its images. Where it turns with what is seen
+    What is wrong with a rig stays where it is in the images. Where it turns with what is seen
     instead, no rig explains it, and nothing is corrected.
 
     Ref: Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986 (the
@@ -184,7 +184,7 @@ def _by_likeness(
 
 def _without_quarters(window: TrackWindow, camera: RectifiedCamera) -> Iterator[NDArray[np.int64]]:
     """Yield the points of a window but each quarter: by column, row, disparity, and radius."""
-    middle = np.nansum(window.uvd, axis=0) / np.isfinite(window.uvd).sum(axis=0).clip(1)
+    middle = middles(window)
     radius = np.linalg.norm(middle[:, :2] - [camera.cx_px, camera.cy_px], axis=1)
     for key in (*middle.T, radius):
         quarters = np.array_split(np.argsort(key), _QUARTERS)

@@ -27,29 +27,31 @@ def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> flo
     count. NaN = there are no others.
     """
 
-    def measured(window: TrackWindow) -> tuple[float, Float64] | None:
-        halves = list(_halves(window)) if len(window.xyz_world) else []
+    def measured(window: TrackWindow) -> list[float]:
+        every = np.ones(len(window.xyz_world), np.bool_)
+        halves = list(_halves(window)) if every.any() else []
         if min((int(half.sum()) for half in halves), default=0) < MIN_INLIERS:
-            return None
-        apart_m = [_length_m(window, half, camera) - _length_m(window, ~half, camera)
-                   for half in halves]  # fmt: skip
-        return _length_m(window, np.ones(len(window.xyz_world), np.bool_), camera), np.array(
-            apart_m
-        )
+            return []
+        lengths_m = [[_length_m(window, part, camera) for part in (half, ~half)] for half in halves]
+        return [_length_m(window, every, camera), *(one - other for one, other in lengths_m)]
 
     with serial_algebra():
-        found = [one for one in side_by_side(measured, windows, threads=FEW) if one is not None]
+        found = [one for one in side_by_side(measured, windows, threads=FEW) if one]
     if not found:
         return float("nan")
-    apart = sum(apart_m for _, apart_m in found) / sum(length_m for length_m, _ in found)
-    return 0.5 * float(np.abs(apart).max())
+    length_m, *apart_m = np.sum(found, axis=0)
+    return 0.5 * float(np.abs(apart_m).max() / length_m)
 
 
 def _halves(window: TrackWindow) -> Iterator[Bool]:
     """Yield halves of the points (N,): the left, the upper and the farther ones."""
-    middle = np.nansum(window.uvd, axis=0) / np.isfinite(window.uvd).sum(axis=0).clip(1)
-    for place in middle.T:
+    for place in middles(window).T:
         yield place < np.median(place)
+
+
+def middles(window: TrackWindow) -> Float64:
+    """Return where points are in the middle of their tracks: column, row, disparity (N, 3)."""
+    return np.asarray(np.nansum(window.uvd, axis=0) / np.isfinite(window.uvd).sum(axis=0).clip(1))
 
 
 def _length_m(window: TrackWindow, chosen: Bool, camera: RectifiedCamera) -> float:
