@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 NO_NAMES = {"utils", "common", "helpers", "misc"}
-MAX_LINES = (400, 600)  # of a file; of one with tests
+MAX_LINES = (500, 600)  # of a file; of one with tests
 TEXT = {"", ".py", ".md", ".toml", ".txt", ".sh", ".yaml", ".yml", ".html", ".js", ".css"}
 OURS = ("recon", "tests", "docs", "examples", "benchmarks", "scripts", ".ci")
 MACHINE_PATH = re.compile(r"(?<![\w.])/(home|root|work|Users|opt|mnt)/\w")
@@ -53,12 +53,11 @@ def test_files_are_short(root):
 
 
 def test_functions_are_short(trees):
-    """House style: half of all functions within 8 lines, 90 % within 30 (kernels apart)."""
+    """House style: nine of ten functions within 40 lines (kernels apart)."""
     modules = [tree for path, tree in trees.items() if "kernels" not in path.parts]
     nodes = [node for tree in modules for node in ast.walk(tree)]
-    lengths = sorted(_body_lines(node) for node in nodes if isinstance(node, ast.FunctionDef))
-    assert statistics.median(lengths) <= 8
-    assert statistics.quantiles(lengths, n=10)[-1] <= 30
+    lengths = [_body_lines(node) for node in nodes if isinstance(node, ast.FunctionDef)]
+    assert statistics.quantiles(lengths, n=10)[-1] <= 40
 
 
 def _body_lines(function: ast.FunctionDef) -> int:
