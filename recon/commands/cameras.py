@@ -257,7 +257,7 @@ def run_audit(
 ) -> Audit:
     """Check a recording before a long run: what `recon audit` does.
 
-    Some stretches of the recording are read, and features are matched in some of their pairs. What
+    Some segments of the recording are read, and features are matched in some of their pairs. What
     they say of rows, time, exposure, focus and calibration gives findings and a verdict.
 
     Args:

@@ -21,7 +21,7 @@ from recon.map.localize.sequence import LocalizedDrive, LocalizedFrame
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.map.store.trees import loop_in
-from recon.odometry.health import stretches
+from recon.odometry.health import segment_numbers
 from recon.places.loop import Loop
 
 _AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
@@ -45,9 +45,9 @@ def export_paths(
     They have the frames that are joined (N,). Each other part of the drive between two breaks has
     ``sessions/<number>/trajectory_tum.txt``, in axes of its own.
     """
-    stretch = stretches(session.health)
-    for number in np.unique(stretch[~joined & (stretch >= 0)]).tolist():
-        apart = session.trajectory.select(stretch == number)
+    segment = segment_numbers(session.health)
+    for number in np.unique(segment[~joined & (segment >= 0)]).tolist():
+        apart = session.trajectory.select(segment == number)
         write_tum(folder / f"sessions/{number}/trajectory_tum.txt", apart)
     path = session.trajectory.select(joined)
     write_kitti_poses(folder / "trajectory_kitti.txt", path)

@@ -86,9 +86,9 @@ def see_baseline(
 ) -> SeenBaseline | None:
     """Compare lengths that were measured along a drive with those that its images show.
 
-    Of a path by other sensors, they are the distances between the ends of a few stretches. What
+    Of a path by other sensors, they are the distances between the ends of a few segments. What
     wheels are off by is common to all of them. None where that may be as much as baselines are off
-    by, or where no stretch can be compared.
+    by, or where no segment can be compared.
 
     Args:
         source: The drive, with its rig refined.
@@ -104,8 +104,8 @@ def see_baseline(
         if source.live or common >= _BASELINE_SIGMA:
             return None
         parts = tracked_parts(len(source))
-        stretches = [_seen(source, config, start, stop, rig_share) for start, stop in parts]
-        beside = [None if one is None else _beside(one, measured) for one in stretches]
+        segments = [_seen(source, config, start, stop, rig_share) for start, stop in parts]
+        beside = [None if one is None else _beside(one, measured) for one in segments]
         lengths = [length for length in beside if length is not None]
     else:
         common, lengths = 0.0, [_between(source, config, measured, rig_share)]
@@ -130,7 +130,7 @@ def _compared(lengths: Float64, common: float) -> SeenBaseline:
 
 
 class _Seen(NamedTuple):
-    """How far apart the ends of a stretch are, by its images, and when it was."""
+    """How far apart the ends of a segment are, by its images, and when it was."""
 
     length_m: float
     sigma_m: float
@@ -143,7 +143,7 @@ class _Seen(NamedTuple):
 def _seen(
     source: StereoSource, config: StereoSettings, start: int, stop: int, rig_share: float | None
 ) -> _Seen | None:
-    """Return what visual odometry shows of a stretch; None = it is lost there, or nothing moves."""
+    """Return what visual odometry shows of a segment; None = it is lost there, or nothing moves."""
     odometry, reconstructor = VisualOdometry(), FrameReconstructor(source.calibration, config)
     found, times_s = list[OdometryResult](), list[float]()
     pairs = islice(source.frames(start), stop - start)
@@ -179,7 +179,7 @@ def _between(
 
 
 def _beside(seen: _Seen, prior: MotionPrior) -> Float64 | None:
-    """Return the same of a stretch and of a prior; None = it has a gap, or nothing moved."""
+    """Return the same of a segment and of a prior; None = it has a gap, or nothing moved."""
     known = prior.motion(seen.from_s, seen.to_s)
     # It is stated from frame to frame; independent errors add in squares.
     own_m = prior.settings.sigma_m * np.sqrt(seen.frames - 1)

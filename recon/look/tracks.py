@@ -100,12 +100,12 @@ class LiveTracks:
     def __init__(self, odometry: VisualOdometry) -> None:
         self._odometry = odometry
         self._tracker = StereoTracker(odometry)
-        self._stretches = list[list[StereoTracks]]()
+        self._segments = list[list[StereoTracks]]()
         self._every = 2
 
     @property
     def windows(self) -> list[StereoTracks]:
-        return [window for stretch in self._stretches for window in stretch]
+        return [window for segment in self._segments for window in segment]
 
     def add(self, index: int, frame: OdometryFrame, found: OdometryResult) -> None:
         """Add the frame that was registered last."""
@@ -114,12 +114,12 @@ class LiveTracks:
             return
         if place == 0:
             self._tracker = StereoTracker(self._odometry)
-            self._stretches.append([])
-        if len(self._stretches) > _PARTS:
-            self._stretches, self._every = self._stretches[::2], 2 * self._every
+            self._segments.append([])
+        if len(self._segments) > _PARTS:
+            self._segments, self._every = self._segments[::2], 2 * self._every
         window = self._tracker.add(frame, found)
         if window is not None:
-            self._stretches[-1].append(window)
+            self._segments[-1].append(window)
 
 
 def _moves(window: TrackWindow, camera: RectifiedCamera) -> bool:

@@ -278,8 +278,8 @@ def _mean(samples: _Samples, values: Float64, count: Int64) -> Float64:
     return np.asarray(np.bincount(samples.patch, values) / np.maximum(count, 1))
 
 
-class StretchCounter:
-    """Numbers the stretches of a drive: in one, poses are measured from one another.
+class SegmentCounter:
+    """Numbers the segments of a drive: in one, poses are measured from one another.
 
     A new one begins where odometry began anew, and after a pose that is not to be trusted unless it
     was skipped: where it lies beside the one before is a guess.
@@ -290,7 +290,7 @@ class StretchCounter:
         self.begun = self._lost = False
 
     def add(self, record: OdometryHealth) -> int:
-        """Return the stretch of the next frame; -1 = its pose is not to be trusted."""
+        """Return the segment of the next frame; -1 = its pose is not to be trusted."""
         if not record.ok:
             self._lost |= not record.skipped
             return -1

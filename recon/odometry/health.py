@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from recon.core.text import counted, metres
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.odometry.checked import StretchCounter
+from recon.odometry.checked import SegmentCounter
 from recon.odometry.protocol import OdometryHealth
 
 _MANY: Final = 0.1
 """Share of frames without a trusted pose above which the whole drive is in question."""
 
-_NAMED: Final = 3  # stretches of frames that a line names
+_NAMED: Final = 3  # segments of frames that a line names
 
 
 def trusted_poses(health: Sequence[OdometryHealth]) -> Bool:
@@ -26,9 +26,9 @@ def trusted_poses(health: Sequence[OdometryHealth]) -> Bool:
     return np.array([record.ok for record in health], np.bool_)
 
 
-def stretches(health: Sequence[OdometryHealth]) -> NDArray[np.int64]:
-    """The stretch (N,) of each frame, by `StretchCounter`."""
-    counter = StretchCounter()
+def segment_numbers(health: Sequence[OdometryHealth]) -> NDArray[np.int64]:
+    """The segment (N,) of each frame, by `SegmentCounter`."""
+    counter = SegmentCounter()
     return np.array([counter.add(record) for record in health], np.int64)
 
 
@@ -47,17 +47,17 @@ def doubt_about(health: Sequence[OdometryHealth]) -> list[str]:
 
 
 def name_frames(indices: Sequence[int]) -> str:
-    """The stretches of numbers in words, the first three of them."""
-    named = [_frames(first, last) for first, last in _stretches(indices)]
+    """The segments of numbers in words, the first three of them."""
+    named = [_frames(first, last) for first, last in _segments(indices)]
     return ", ".join([*named[:_NAMED], *(["…"] if len(named) > _NAMED else [])])
 
 
 def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
-    """One line per distinct warning, and per stretch of frames without a trusted pose."""
+    """One line per distinct warning, and per segment of frames without a trusted pose."""
     texts = dict.fromkeys(line for record in health for line in record.warnings)
     lines = [f"{_named(health, line)}: {line}" for line in texts]
     bad = [index for index, record in enumerate(health) if not record.ok]
-    for first, last in _stretches(bad):
+    for first, last in _segments(bad):
         why = "; ".join(dict.fromkeys(health[first].notes)) or "no reason recorded"
         where = _frames(first, last)
         lines.append(f"{where}: the pose is not to be trusted, nothing of it is mapped ({why})")
@@ -74,15 +74,15 @@ def _frames(first: int, last: int) -> str:
     return f"frame {first}" if first == last else f"frames {first}-{last}"
 
 
-def _stretches(indices: Sequence[int]) -> list[tuple[int, int]]:
+def _segments(indices: Sequence[int]) -> list[tuple[int, int]]:
     """Runs of consecutive numbers as (first, last)."""
-    stretches: list[tuple[int, int]] = []
+    segment_numbers: list[tuple[int, int]] = []
     for index in indices:
-        if stretches and index == stretches[-1][1] + 1:
-            stretches[-1] = (stretches[-1][0], index)
+        if segment_numbers and index == segment_numbers[-1][1] + 1:
+            segment_numbers[-1] = (segment_numbers[-1][0], index)
         else:
-            stretches.append((index, index))
-    return stretches
+            segment_numbers.append((index, index))
+    return segment_numbers
 
 
 RIG_DISPARITY_PX: Final = 0.1

@@ -30,7 +30,7 @@ from recon.places.closure import (
     Closure,
     DrivePath,
     bend_path,
-    longest_stretch,
+    longest_segment,
     nodes_along,
     odometry_edges,
 )
@@ -84,12 +84,12 @@ def adjust_path(
 ) -> Adjustment | None:
     """Adjust a path whose loops are closed; None = points that were left out fit no better then.
 
-    Fixed is the first pose of the longest stretch, as for `close_loops`.
+    Fixed is the first pose of the longest segment, as for `close_loops`.
     """
     stride = math.ceil(len(keyframes.frames) / _MOST_KEYFRAMES)
     frames = keyframes.frames[::stride] if stride else []
     nodes = nodes_along(path, math.inf, frames)
-    if not closure.closed or len(nodes) <= len(set(path.stretch.tolist())):
+    if not closure.closed or len(nodes) <= len(set(path.segment.tolist())):
         return None
     start = closure.trajectory.T_world_camera[nodes]
     pairs = list(_matched(path, closure, frames, keyframes, camera))
@@ -99,7 +99,7 @@ def adjust_path(
     edges = odometry_edges(path, nodes, 0, USUAL)
     graph = PoseGraph.of(edges, math.inf, len(nodes))
     ends = np.concatenate([graph.ends, np.searchsorted(nodes, [pair.nodes for pair in pairs])])
-    anchor = int(np.argmax(path.stretch[nodes] == longest_stretch(path.stretch)))
+    anchor = int(np.argmax(path.segment[nodes] == longest_segment(path.segment)))
     graph = replace(graph, free=free_nodes(ends, len(nodes), anchor))
     left_out = np.arange(seen.points) % _HELD_OUT == 0
     sigma_px = feature_sigma_px(camera), SIGMA_D_PX
@@ -175,7 +175,7 @@ def _pairs(
     known = set(frames)
     for number, last in enumerate(frames):
         for first in (frames[number - back] for back in _BEFORE if back <= number):
-            if path.stretch[first] == path.stretch[last]:
+            if path.segment[first] == path.segment[last]:
                 yield first, last, None
         for loop in loops.get(last, ()):
             if loop.first in known:

@@ -16,7 +16,7 @@ from recon.core.geometry.alignment import pose_between
 from recon.core.geometry.se3 import adjoint, as_step, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.odometry.health import stretches, trusted_poses
+from recon.odometry.health import segment_numbers, trusted_poses
 from recon.odometry.protocol import OdometryHealth
 from recon.places.fixes import Held
 from recon.places.loop import MIN_AGREEING, Loop
@@ -68,9 +68,9 @@ class DrivePath:
     # float64 (N,), path up to each frame, by `path_lengths`; 0 everywhere where poses are known,
     # which moves the drive as one rigid thing
     path_m: Float64
-    # int64 (N,), the stretch of each frame (`recon.odometry.health.stretches`): odometry says
-    # nothing of what lies between two of them, or of a frame of stretch -1
-    stretch: NDArray[np.int64]
+    # int64 (N,), the segment of each frame (`recon.odometry.health.segment_numbers`): odometry says
+    # nothing of what lies between two of them, or of a frame of segment -1
+    segment: NDArray[np.int64]
     # float64 (N, 2), summed variances of the motions up to each frame, as odometry states them:
     # of positions (m²) and of rotations (rad²)
     variance: Float64
@@ -84,7 +84,7 @@ class DrivePath:
             path_m = np.zeros(len(health))
         sigma = np.array([(record.sigma_m, np.deg2rad(record.sigma_deg)) for record in health])
         variance = np.cumsum(np.nan_to_num(sigma, posinf=0.0) ** 2, axis=0)
-        return DrivePath(odometry, path_m, stretches(health), variance, scale)
+        return DrivePath(odometry, path_m, segment_numbers(health), variance, scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def close_loops(path: DrivePath, loops: Sequence[Loop]) -> Closure:
     joined = join_drives([path], [Tie((0, 0), loop) for loop in loops]) if loops else None
     if joined is None:  # a map by odometry alone is better than none
         return Closure(path.trajectory, (), tuple(loops))
-    believed = _believed(loops, joined.kept, path.stretch)
+    believed = _believed(loops, joined.kept, path.segment)
     closed, refused = (
         tuple(loop for loop, kept in zip(loops, believed, strict=True) if kept == side)
         for side in (True, False)
@@ -119,12 +119,12 @@ def close_loops(path: DrivePath, loops: Sequence[Loop]) -> Closure:
     return Closure(joined.trajectories[0], closed, refused)
 
 
-def _believed(loops: Sequence[Loop], kept: Bool, stretch: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _believed(loops: Sequence[Loop], kept: Bool, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return bool (L,), which loops are believed: not those that alone hold two parts of a drive.
 
-    Stretches are put together where loops enough that contradict none hold them.
+    Segments are put together where loops enough that contradict none hold them.
     """
-    ends = stretch[np.array([(loop.first, loop.last) for loop in loops])]
+    ends = segment[np.array([(loop.first, loop.last) for loop in loops])]
     while True:
         apart = kept & (ends[:, 0] != ends[:, 1])
         pairs, counts = np.unique(np.sort(ends[apart], axis=1), axis=0, return_counts=True)
@@ -139,8 +139,8 @@ def join_drives(
 ) -> JoinedDrives | None:
     """Correct the paths of drives so that their ties hold; None = the ties are not believed.
 
-    Fixed is the first pose of the longest stretch of the first drive. Nodes are spaced along the
-    paths; odometry edges link each to the next of its stretch, ties link distant ones. The
+    Fixed is the first pose of the longest segment of the first drive. Nodes are spaced along the
+    paths; odometry edges link each to the next of its segment, ties link distant ones. The
     optimiser may switch ties off. It starts with a tolerance that admits every tie and tightens it
     step by step, so that a right one is not refused because of the very drift that it corrects. If
     the ties deform the odometry of a drive more than its drift explains, none is believed.
@@ -158,11 +158,11 @@ def join_drives(
     edges = [_tie_edge(tie, drives, nodes, begins) for tie in ties]
     start = [d.trajectory.T_world_camera[own] for d, own in zip(drives, nodes, strict=True)]
     parts = [
-        _numbered(d.stretch[own], k) for k, (d, own) in enumerate(zip(drives, nodes, strict=True))
+        _numbered(d.segment[own], k) for k, (d, own) in enumerate(zip(drives, nodes, strict=True))
     ]
-    root = longest_stretch(drives[0].stretch)
+    root = longest_segment(drives[0].segment)
     begun = _beside(np.concatenate(start), np.concatenate(parts), root, ties, edges)
-    anchor = int(np.argmax(drives[0].stretch[nodes[0]] == root))
+    anchor = int(np.argmax(drives[0].segment[nodes[0]] == root))
     steps = [edge for chain in chains for edge in chain]
     try:
         if held is None:
@@ -196,14 +196,14 @@ def misfit(edge: PoseEdge, T_world_node: Float64) -> float:
     return float(step @ edge.information @ step)
 
 
-def longest_stretch(stretch: NDArray[np.int64]) -> int:
-    """Return the stretch of a drive that has most frames."""
-    return int(np.bincount(stretch + 1, minlength=2)[1:].argmax())
+def longest_segment(segment: NDArray[np.int64]) -> int:
+    """Return the segment of a drive that has most frames."""
+    return int(np.bincount(segment + 1, minlength=2)[1:].argmax())
 
 
-def _numbered(stretch: NDArray[np.int64], drive: int) -> NDArray[np.int64]:
-    """Return the stretches (N,) of a drive, numbered so that no other drive has the same."""
-    return stretch + (drive << 32)
+def _numbered(segment: NDArray[np.int64], drive: int) -> NDArray[np.int64]:
+    """Return the segments (N,) of a drive, numbered so that no other drive has the same."""
+    return segment + (drive << 32)
 
 
 def _tied_frames(ties: Sequence[Tie], drive: int) -> list[int]:
@@ -221,12 +221,12 @@ def _spaced(drives: Sequence[DrivePath], tied: Sequence[list[int]]) -> list[NDAr
 
 
 def nodes_along(drive: DrivePath, gap_m: float, tied: Sequence[int]) -> NDArray[np.intp]:
-    """Return frames at even distances along each stretch, its first and last, and those tied."""
+    """Return frames at even distances along each segment, its first and last, and those tied."""
     nodes = [np.array(tied, np.intp)]
-    if drive.stretch.max() < 0:
+    if drive.segment.max() < 0:
         return np.zeros(1, np.intp)
-    for number in range(int(drive.stretch.max()) + 1):
-        frames = np.flatnonzero(drive.stretch == number)
+    for number in range(int(drive.segment.max()) + 1):
+        frames = np.flatnonzero(drive.segment == number)
         along_m = drive.path_m[frames] - drive.path_m[frames[0]]
         if along_m[-1] > 0.0:
             count = math.ceil(float(along_m[-1]) / gap_m) + 1
@@ -303,7 +303,7 @@ def odometry_edges(
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     edges = []
     for k, (first, last) in enumerate(pairwise(nodes), begin):
-        if drive.stretch[first] != drive.stretch[last]:
+        if drive.segment[first] != drive.segment[last]:
             continue
         # Where the camera stands still, 0.1 m keeps the information finite.
         between_m = max(float(path_m[last] - path_m[first]), 0.1 * drive.scale)
@@ -336,7 +336,7 @@ def _to_node(drive: DrivePath, nodes: NDArray[np.intp], frame: int) -> tuple[int
     """Return the node nearest to a frame, ``T_node_frame``, and the path between them."""
     poses, path_m = drive.trajectory.T_world_camera, drive.path_m
     away_m = np.abs(path_m[nodes] - path_m[frame])
-    node = int(np.argmin(np.where(drive.stretch[nodes] == drive.stretch[frame], away_m, np.inf)))
+    node = int(np.argmin(np.where(drive.segment[nodes] == drive.segment[frame], away_m, np.inf)))
     T = invert(poses[nodes[node]]) @ poses[frame]
     return node, T, float(away_m[node])
 
@@ -353,7 +353,7 @@ def bend_path(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) 
     before = np.maximum(before, 0)
     after = np.minimum(before + 1, len(nodes) - 1)
     # A frame whose pose is not known goes on from the last node.
-    same = drive.stretch[nodes[after]] == drive.stretch[nodes[before]]
+    same = drive.segment[nodes[after]] == drive.segment[nodes[before]]
     after = np.where(same, after, before)
     new = np.empty_like(old)
     for frame, (i, j) in enumerate(zip(before, after, strict=True)):

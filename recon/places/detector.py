@@ -38,7 +38,7 @@ _HERE: Final = (3, 3)
 """Loops of a keyframe that are enough, and how many more candidates may fail, where it is compared
 with places that odometry says it may be near."""
 
-_ANYWHERE: Final = (10, 8)  # the same where odometry says nothing: another stretch of the drive
+_ANYWHERE: Final = (10, 8)  # the same where odometry says nothing: another segment of the drive
 _MIN_LIKENESS: Final = 0.3
 """Least likeness of a candidate, as a share of that of two neighbouring keyframes."""
 
@@ -50,7 +50,7 @@ class StoredKeyframe:
     keyframe: Keyframe  # features and coarse disparities
     T_world_camera: Float64  # (4, 4), by odometry
     path_m: float  # path up to it, by `path_lengths`
-    stretch: int = 0  # of the drive that it belongs to: nothing is known between stretches
+    segment: int = 0  # of the drive that it belongs to: nothing is known between segments
     loops: tuple[Loop, ...] = ()  # verified loops that end in it
     refused: tuple[str, ...] = ()  # why other candidates were refused
 
@@ -74,7 +74,7 @@ class LastView:
 
     coarse: Float32  # (h, w), `coarse_of` its disparity
     T_world_camera: Float64  # (4, 4)
-    stretch: int = 0  # of the drive
+    segment: int = 0  # of the drive
 
 
 class NewViews:
@@ -87,9 +87,9 @@ class NewViews:
         self._camera = camera
         self.last: LastView | None = None
 
-    def is_new(self, disparity: Disparity, T_world_camera: Float64, stretch: int = 0) -> bool:
+    def is_new(self, disparity: Disparity, T_world_camera: Float64, segment: int = 0) -> bool:
         last = self.last
-        if last is None or last.stretch != stretch:
+        if last is None or last.segment != segment:
             return True
         T_last_new = invert(last.T_world_camera) @ T_world_camera
         shares = (
@@ -146,19 +146,19 @@ class LoopDetector:
         T_world_camera: Float64,
         *,
         path_m: float,
-        stretch: int = 0,
+        segment: int = 0,
     ) -> tuple[Loop, ...]:
         """Add the next frame; return its verified loops, which ``loops`` keeps as well.
 
         A frame is a keyframe if it sees enough that the last one did not, or too little of what
-        that did, or another stretch of the drive begins; not one that was not matched, or with a
-        pose that is not trusted, of stretch -1. ``path_m`` is the path up to it, by `path_lengths`.
+        that did, or another segment of the drive begins; not one that was not matched, or with a
+        pose that is not trusted, of segment -1. ``path_m`` is the path up to it, by `path_lengths`.
         """
-        seen = stretch >= 0 and bool(disparity.measured.any())
-        if not seen or not self._views.is_new(disparity, T_world_camera, stretch):
+        seen = segment >= 0 and bool(disparity.measured.any())
+        if not seen or not self._views.is_new(disparity, T_world_camera, segment):
             return ()
         keyframe = make_keyframe(frame, pair, disparity)
-        return self.look(StoredKeyframe(keyframe, T_world_camera, path_m, stretch))
+        return self.look(StoredKeyframe(keyframe, T_world_camera, path_m, segment))
 
     def look(self, new: StoredKeyframe) -> tuple[Loop, ...]:
         """Add the next keyframe; return its verified loops."""
@@ -170,18 +170,18 @@ class LoopDetector:
     def restore(self, stored: StoredKeyframe) -> None:
         """Add a keyframe of an interrupted drive, with its loops."""
         self._places.add(self._place(stored))
-        self._views.last = LastView(stored.keyframe.coarse, stored.T_world_camera, stored.stretch)
+        self._views.last = LastView(stored.keyframe.coarse, stored.T_world_camera, stored.segment)
         self.loops.extend(stored.loops)
         self.refused.update(stored.refused)
 
     def agreeing(self) -> list[Loop]:
-        """Return the loops that enough others confirm, and those between two stretches.
+        """Return the loops that enough others confirm, and those between two segments.
 
-        How these confirm one another is not known before all stretches are placed.
+        How these confirm one another is not known before all segments are placed.
         """
         places = self._places
         known = zip(
-            places.T_world_camera, places.path_m.tolist(), places.stretches.tolist(), strict=True
+            places.T_world_camera, places.path_m.tolist(), places.segments.tolist(), strict=True
         )
         poses = dict(zip(places.frames, known, strict=True))
         apart = {id(one) for one in self.loops if poses[one.first][2] != poses[one.last][2]}
@@ -193,12 +193,12 @@ class LoopDetector:
         keyframe, reach_m = stored.keyframe, reach_of(stored.keyframe.depth_m(self._camera))
         words = words_of(keyframe.descriptors)
         pose = stored.T_world_camera
-        return Place(keyframe.frame, pose, stored.path_m, stored.stretch, reach_m, words)
+        return Place(keyframe.frame, pose, stored.path_m, stored.segment, reach_m, words)
 
     def _compared(self, new: StoredKeyframe) -> StoredKeyframe:
         """The keyframe with its loops to the candidates that are verified."""
         place, places = self._place(new), self._places
-        elsewhere = places.stretches != place.stretch
+        elsewhere = places.segments != place.segment
         here = self._loops_among(places.near(place) & ~elsewhere, new, place, *_HERE)
         there = self._loops_among(elsewhere, new, place, *_ANYWHERE)
         return replace(new, loops=(*here[0], *there[0]), refused=(*here[1], *there[1]))
@@ -240,7 +240,7 @@ class LoopDetector:
 
     def _possible(self, old: int, new: Place, loop: Loop) -> bool:
         """Whether drift explains the difference between a loop and odometry, if there was any."""
-        if self._places.stretches[old] != new.stretch:
+        if self._places.segments[old] != new.segment:
             return True
         T = invert(self._places.T_world_camera[old]) @ new.T_world_camera
         drift = drift_over(new.path_m - float(self._places.path_m[old]), self._scale)

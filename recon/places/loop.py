@@ -33,8 +33,8 @@ class Loop:
 
 
 Poses: TypeAlias = Mapping[int, tuple[Float64, float, int]]
-"""For each keyframe its pose by odometry, the path up to it, and the stretch of the drive that it
-belongs to: nothing is known between stretches."""
+"""For each keyframe its pose by odometry, the path up to it, and the segment of the drive that it
+belongs to: nothing is known between segments."""
 
 
 def loop_sigmas(scale: float) -> Drift:

@@ -18,7 +18,7 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
-_BETWEEN: Final = 3.0  # path between two places of a stretch that are compared, in reaches
+_BETWEEN: Final = 3.0  # path between two places of a segment that are compared, in reaches
 _REACH: Final = 0.5  # share of the depth of what is seen, within which most of it is seen, too
 _APART: Final = 0.5  # share of that distance which is between two candidates
 VIEW_DEG: Final = 45.0  # largest angle between viewing directions that see enough in common
@@ -31,7 +31,7 @@ class Place:
     frame: int  # its frame
     T_world_camera: Float64  # (4, 4), by odometry
     path_m: float  # path up to it, by `path_lengths`
-    stretch: int  # of the drive that it belongs to: nothing is known between stretches
+    segment: int  # of the drive that it belongs to: nothing is known between segments
     reach_m: float  # distance at which other places see enough in common
     words: NDArray[np.uint32]  # uint32 (W,), sorted, each once
 
@@ -47,7 +47,7 @@ class Places:
         self._frames: list[int] = []
         self._poses = np.empty((64, 4, 4))
         self._path_m = np.empty(64)
-        self._stretches = np.empty(64, np.int64)
+        self._segments = np.empty(64, np.int64)
         self._words = WordIndex()
 
     def __len__(self) -> int:
@@ -58,9 +58,9 @@ class Places:
         if count == len(self._path_m):
             self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
             self._path_m = np.concatenate([self._path_m, np.empty_like(self._path_m)])
-            self._stretches = np.concatenate([self._stretches, np.empty_like(self._stretches)])
+            self._segments = np.concatenate([self._segments, np.empty_like(self._segments)])
         self._poses[count], self._path_m[count] = place.T_world_camera, place.path_m
-        self._stretches[count] = place.stretch
+        self._segments[count] = place.segment
         self._frames.append(place.frame)
         self._words.add(place.words)
 
@@ -79,12 +79,12 @@ class Places:
         return self._path_m[: len(self)]
 
     @property
-    def stretches(self) -> NDArray[np.int64]:
-        """int64 (N,), stretch of the drive that each belongs to."""
-        return self._stretches[: len(self)]
+    def segments(self) -> NDArray[np.int64]:
+        """int64 (N,), segment of the drive that each belongs to."""
+        return self._segments[: len(self)]
 
     def near(self, place: Place) -> Bool:
-        """Return bool (N,), those of its stretch that drift allows to be in view of a later one."""
+        """Return bool (N,), those of its segment that drift allows to be in view of a later one."""
         way_m = place.path_m - self.path_m
         sigma_m, sigma_rad = spread_over(np.maximum(way_m, 0.0), self._scale)
         T = invert(self.T_world_camera) @ place.T_world_camera
@@ -92,14 +92,14 @@ class Places:
         turned = angle_rad(T) - SIGMAS * sigma_rad
         near = (far_m <= place.reach_m) & (turned <= np.deg2rad(VIEW_DEG))
         before = way_m >= _BETWEEN * place.reach_m
-        return np.asarray(near & before & (self.stretches == place.stretch))
+        return np.asarray(near & before & (self.segments == place.segment))
 
     def around(self, number: int, T_place_camera: Float64, reach_m: float) -> list[int]:
         """Return the places of a place's stretch in view of a camera beside it, nearest first."""
         T = invert(self.T_world_camera) @ self.T_world_camera[number] @ T_place_camera
         far_m = np.linalg.norm(T[:, :3, 3], axis=1)
         near = (far_m <= reach_m) & (angle_rad(T) <= np.deg2rad(VIEW_DEG))
-        found = np.flatnonzero(near & (self.stretches == self.stretches[number]))
+        found = np.flatnonzero(near & (self.segments == self.segments[number]))
         nearest: list[int] = found[np.argsort(far_m[found], kind="stable")].tolist()
         return nearest
 
@@ -267,24 +267,24 @@ class PathFit:
     scaled_m: float  # the same after a fit that also scales the path
     scale: float  # how many times as far from one another as those of the path the positions are
     most_m: float  # largest distance that drift and noise explain
-    most_stretch: float  # largest difference of the scale from 1 that they explain
+    most_scaling: float  # largest difference of the scale from 1 that they explain
 
     @property
-    def stretched(self) -> bool:
+    def rescaled(self) -> bool:
         """Whether the scale is one that nothing explains."""
-        return abs(self.scale - 1.0) > self.most_stretch
+        return abs(self.scale - 1.0) > self.most_scaling
 
     @property
     def other_unit(self) -> bool:
         """Whether it is the same path, but in another unit; a scale that is off is none."""
         apart = abs(math.log(max(self.scale, _TINY)))
-        return self.stretched and self.scaled_m <= self.most_m and apart > math.log(_OTHER_UNIT)
+        return self.rescaled and self.scaled_m <= self.most_m and apart > math.log(_OTHER_UNIT)
 
     def check(self, where: str | PathLike[str], hint: str) -> None:
         """Refuse positions that neither drift nor noise explains."""
-        if self.rms_m <= self.most_m and not self.stretched:
+        if self.rms_m <= self.most_m and not self.rescaled:
             return
-        least, most = max(0.0, 1.0 - self.most_stretch), 1.0 + self.most_stretch
+        least, most = max(0.0, 1.0 - self.most_scaling), 1.0 + self.most_scaling
         raise EvaluationError(
             "neither drift nor noise explains how far positions and path are apart",
             where=where,
@@ -309,7 +309,7 @@ def fit_to_path(
         scaled_m=_apart_m(apply(scaled.T_to_from, scaled.scale * ours_m), position_m),
         scale=scaled.scale,
         most_m=SIGMAS * math.hypot(drift_m, sigma_m),
-        most_stretch=SIGMAS
+        most_scaling=SIGMAS
         * math.hypot(drift_m / max(path_m, _SHORTEST_M), sigma_m / max(spread_m, _SHORTEST_M)),
     )
 

@@ -47,7 +47,7 @@ def test_a_place_seen_again_joins_what_a_break_has_parted(
 ):
     folder, run = whole
     summary, count = summary_of(folder), len(street_film)
-    assert [(one["first"], one["last"], one["joined"]) for one in summary["drive_sessions"]] == [
+    assert [(one["first"], one["last"], one["joined"]) for one in summary["segments"]] == [
         (0, count - 1, True), (count, count + 4, False), (count + 5, 2 * count + 4, True),
     ]  # fmt: skip
     assert summary["frames_joined"] == 2 * count
@@ -69,7 +69,7 @@ def test_live_the_sessions_are_the_same_and_said_first(
     be_patient(monkeypatch)
     options = MapOptions("live", tmp_path, mesh=False)
     summary, count = run_live(broken, load_config(), options, rate=10.0), len(street_film)
-    sessions = [(one["first"], one["joined"]) for one in summary["drive_sessions"]]
+    sessions = [(one["first"], one["joined"]) for one in summary["segments"]]
     assert sessions == [(0, True), (count, False), (count + 5, True)]
     assert summary["warnings"][0].startswith("THE PATH BREAKS INTO 3 SESSIONS")
 

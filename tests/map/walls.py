@@ -59,7 +59,7 @@ def drive(
 ) -> Session:  # fmt: skip
     """Map a drive whose own world begins with its first camera; ``drift`` stretches its path.
 
-    ``health`` of some frames is not good; where a stretch ends, a submap does.
+    ``health`` of some frames is not good; where a segment ends, a submap does.
     Drives of one ``seed`` without other ``noise`` have the same images, from frame ``first`` on.
     """
     session = map_.begin(SessionInfo(name, "of a test", len(true), config.model_dump(mode="json")))

@@ -17,7 +17,7 @@ from recon.odometry.health import (
     expected_drift,
     health_warnings,
     name_frames,
-    stretches,
+    segment_numbers,
 )
 from recon.odometry.protocol import OdometryFrame, OdometryHealth
 from recon.odometry.registry import ODOMETRIES, KnownPoses, make_odometry
@@ -129,10 +129,10 @@ def test_what_is_lost_is_named_by_stretches_and_said_of_a_drive():
     assert len(others) == 1
     warned = replace(FINE, warnings=("rows are off",))
     assert health_warnings([warned, FINE, warned, FINE]) == ["frames 0-2: rows are off"]
-    assert stretches([FINE, SKIPPED, FINE, LOST, FINE, FINE]).tolist() == [0, -1, 0, -1, 1, 1]
-    assert stretches([FINE, LOST, SKIPPED, FINE]).tolist() == [0, -1, -1, 1]
-    assert stretches([LOST, BEGINS, FINE, BEGINS, FINE]).tolist() == [-1, 0, 0, 1, 1]
-    assert stretches([]).tolist() == []
+    assert segment_numbers([FINE, SKIPPED, FINE, LOST, FINE, FINE]).tolist() == [0, -1, 0, -1, 1, 1]
+    assert segment_numbers([FINE, LOST, SKIPPED, FINE]).tolist() == [0, -1, -1, 1]
+    assert segment_numbers([LOST, BEGINS, FINE, BEGINS, FINE]).tolist() == [-1, 0, 0, 1, 1]
+    assert segment_numbers([]).tolist() == []
     assert doubt_about([FINE] * 3) == []
     (line,) = doubt_about([*[FINE] * 20, LOST, *[FINE] * 20])
     assert line == "1 of 41 poses are not to be trusted (frame 20): nothing of them is in the map"

@@ -11,7 +11,7 @@ from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import Disparity, Trajectory
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.features import in_crowd
-from recon.odometry.health import stretches
+from recon.odometry.health import segment_numbers
 from recon.odometry.prior import MotionPrior
 from recon.odometry.prior_axes import find_axes, first_moving
 from recon.odometry.protocol import OdometryFrame, OdometryResult
@@ -142,7 +142,7 @@ def test_a_drive_that_begins_blind_begins_where_it_sees(blind, street):
     results = [odometry.register(frame) for frame in [blind(), blind(), *street[:4]]]
     np.testing.assert_allclose(results[2].T_world_camera, np.eye(4), atol=1e-12)
     # One stretch: there is nothing before it to be apart from.
-    assert stretches([result.health for result in results]).tolist() == [-1, -1, 0, 0, 0, 0]
+    assert segment_numbers([result.health for result in results]).tolist() == [-1, -1, 0, 0, 0, 0]
 
 
 def test_the_stated_error_of_a_motion_is_about_its_error(results, street_poses):

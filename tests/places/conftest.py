@@ -73,17 +73,17 @@ class Filmed:
     def keyframe(self, index: int) -> Keyframe:
         return make_keyframe(index, *self.frame(index))
 
-    def detect(self, frames, path: Trajectory, stretches=None):
+    def detect(self, frames, path: Trajectory, segments=None):
         """A detector that has seen some frames, and the path up to each frame.
 
-        ``stretches`` has those of frames that are not of stretch 0.
+        ``segments`` has those of frames that are not of segment 0.
         """
-        stretch = [(stretches or {}).get(k, 0) for k in range(len(path))]
-        path_m = path_lengths(path.T_world_camera, np.array(stretch) >= 0)
+        segment = [(segments or {}).get(k, 0) for k in range(len(path))]
+        path_m = path_lengths(path.T_world_camera, np.array(segment) >= 0)
         detector = LoopDetector(KeyframeMemory(), self.camera.world.camera)
         for k in frames:
             pose = path.T_world_camera[k]
-            detector.add(k, *self.frame(k), pose, path_m=path_m[k], stretch=stretch[k])
+            detector.add(k, *self.frame(k), pose, path_m=path_m[k], segment=segment[k])
         return detector, path_m
 
 

@@ -61,11 +61,11 @@ REACH_M = 12.0
 
 
 def _place(
-    frame: int, x_m: float, path_m: float, turned_deg: float = 0.0, stretch: int = 0
+    frame: int, x_m: float, path_m: float, turned_deg: float = 0.0, segment: int = 0
 ) -> Place:
     R = se3.exp_so3(np.array([0.0, np.radians(turned_deg), 0.0]))
     T = se3.make_transform(R, np.array([x_m, 0.0, 0.0]))
-    return Place(frame, T, path_m, stretch, REACH_M, np.zeros(0, np.uint32))
+    return Place(frame, T, path_m, segment, REACH_M, np.zeros(0, np.uint32))
 
 
 def test_a_place_is_near_if_odometry_could_be_so_wrong():
@@ -78,7 +78,7 @@ def test_a_place_is_near_if_odometry_could_be_so_wrong():
     for share in (0.99, 1.01):
         places.add(_place(len(places), 0.0, 0.0, share * turn_deg))
     places.add(_place(9, 0.0, 100.0 - 0.9 * places_file._BETWEEN * REACH_M))
-    places.add(_place(10, 0.0, 0.0, stretch=1))
+    places.add(_place(10, 0.0, 0.0, segment=1))
     near = places.near(_place(11, 0.0, 100.0))
     assert near.tolist() == [True, True, False, True, False, False, False]
 

@@ -30,7 +30,7 @@ from recon.map.drive.mapper import FrameResult, Mapper
 from recon.map.map import Map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
-from recon.odometry.health import stretches
+from recon.odometry.health import segment_numbers
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.places.detector import LastView, NewViews
 from recon.places.keyframe import coarse_of
@@ -122,7 +122,7 @@ class Drive:
 
     def _add(self, frame: ReconstructedFrame, found: OdometryResult) -> FrameResult:
         result = self.mapper.add(frame, found, total=self._total)
-        self._loops.add(frame, result.T_world_camera, result.stretch)
+        self._loops.add(frame, result.T_world_camera, result.segment)
         if result.index <= self._total // 2 and (self.sample is None or len(frame.cloud)):
             self.sample = frame
         if self._due():
@@ -181,7 +181,7 @@ class Drive:
             self._views.last = LastView(**state["last_view"])
         if len(self.session):
             path, health = self.session.odometry, self.session.health
-            self._loops.restore(path.T_world_camera, stretches(health))
+            self._loops.restore(path.T_world_camera, segment_numbers(health))
         self._saved = len(self.mapper)
         self._last = time.perf_counter()
         self._start = self._last - state["seconds"]

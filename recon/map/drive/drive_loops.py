@@ -112,9 +112,9 @@ class LoopWatch:
         self._path_m: list[float] = []
         self._last: Float64 = np.eye(4)
 
-    def add(self, frame: ReconstructedFrame, T_world_camera: Float64, stretch: int) -> None:
+    def add(self, frame: ReconstructedFrame, T_world_camera: Float64, segment: int) -> None:
         """Add the next frame; earlier ones may still be in progress."""
-        path_m, number = self._advance(T_world_camera, stretch), len(self._path_m) - 1
+        path_m, number = self._advance(T_world_camera, segment), len(self._path_m) - 1
 
         def look() -> None:
             with self._stage("loops"):
@@ -124,7 +124,7 @@ class LoopWatch:
                     frame.disparity,
                     T_world_camera,
                     path_m=path_m,
-                    stretch=stretch,
+                    segment=segment,
                 )
 
         self._wait(_BEHIND)
@@ -138,10 +138,10 @@ class LoopWatch:
         """End the thread; pending frames are dropped."""
         self._pool.shutdown(cancel_futures=True)
 
-    def restore(self, T_world_camera: Iterable[Float64], stretches: NDArray[np.int64]) -> None:
+    def restore(self, T_world_camera: Iterable[Float64], segments: NDArray[np.int64]) -> None:
         """Resume after frames with these poses, whose keyframes are kept."""
-        for T, stretch in zip(T_world_camera, stretches.tolist(), strict=True):
-            self._advance(T, stretch)
+        for T, segment in zip(T_world_camera, segments.tolist(), strict=True):
+            self._advance(T, segment)
         for stored in self._keyframes:
             self._detector.restore(stored)
 
@@ -167,10 +167,10 @@ class LoopWatch:
         while len(self._waiting) > left:
             self._waiting.popleft().result()
 
-    def _advance(self, T_world_camera: Float64, stretch: int) -> float:
+    def _advance(self, T_world_camera: Float64, segment: int) -> float:
         """Return path length up to the next frame, as the detector measures it."""
         before = self._last if self._path_m else T_world_camera
-        poses, trusted = np.stack([before, T_world_camera]), np.array([True, stretch >= 0])
+        poses, trusted = np.stack([before, T_world_camera]), np.array([True, segment >= 0])
         step = path_lengths(poses, trusted, self._scale)
         self._path_m.append((self._path_m[-1] if self._path_m else 0.0) + float(step[1]))
         self._last = T_world_camera

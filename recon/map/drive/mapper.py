@@ -28,7 +28,7 @@ from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.submaps import Submap, SubmapSettings
-from recon.odometry.checked import StretchCounter
+from recon.odometry.checked import SegmentCounter
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.stereo.frame import ReconstructedFrame
 
@@ -54,7 +54,7 @@ class Mapper:
         self.session, self._stage = session, stopwatch.stage
         self._fusion_range_m = fusion_range_m(camera, config.fusion)
         self._behind = OneBehind()
-        self._stretches = StretchCounter()
+        self._segments = SegmentCounter()
         self._builder: SubmapBuilder | None = None
         self._grain = ray_grain(config.occupancy) if config.occupancy.keep_rays else None
 
@@ -78,9 +78,9 @@ class Mapper:
         # A hole in the map is better than wrong geometry.
         cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))
         rays = frame.rays if health.ok else None
-        before, begun = self._stretches.number, self._stretches.begun
-        stretch = self._stretches.add(health)
-        if stretch > before:
+        before, begun = self._segments.number, self._segments.begun
+        segment = self._segments.add(health)
+        if segment > before:
             self.close()  # the map may have to do without what follows
         builder = self._builder
         if builder is None or (health.ok and not begun):  # frames that show nothing come first
@@ -89,7 +89,7 @@ class Mapper:
         self._behind.begin(partial(self._integrate, *work))
         self.session.add_frame(T_world_camera, frame.pair.timestamp_s, health)
         valid_share = float(np.mean(frame.disparity.measured))
-        found = (len(frame.cloud), T_world_camera, health, stretch)
+        found = (len(frame.cloud), T_world_camera, health, segment)
         return FrameResult(len(self) - 1, total, 0.0, valid_share, *found)
 
     def _integrate(
@@ -136,7 +136,7 @@ class Mapper:
     def restore(self, state: dict[str, Any]) -> None:
         self._odometry.restore(state["odometry"])
         for record in self.session.health:
-            self._stretches.add(record)
+            self._segments.add(record)
         if state["builder"] is not None:
             self._builder = self._new_builder()
             self._builder.restore(state["builder"])
@@ -260,7 +260,7 @@ class FrameResult:
     points: int  # number of points in the cloud of the frame
     T_world_camera: Float64  # (4, 4)
     health: OdometryHealth
-    stretch: int = 0  # of the drive, see `StretchCounter`; -1 = the pose is not trusted
+    segment: int = 0  # of the drive, see `SegmentCounter`; -1 = the pose is not trusted
 
     def __post_init__(self) -> None:
         freeze(self, "T_world_camera", np.float64, (4, 4))

@@ -41,7 +41,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
 from recon.odometry.checked import CheckedOdometry
-from recon.odometry.health import name_frames, stretches
+from recon.odometry.health import name_frames, segment_numbers
 from recon.odometry.imu_fit import FittedImu
 from recon.odometry.protocol import Odometry, OdometryHealth
 from recon.odometry.sfm.find import SfmOptions, find_poses
@@ -52,7 +52,7 @@ from recon.stereo.frame import CloudSettings, FrameReconstructor, ReconstructedF
 
 
 @dataclass(frozen=True)
-class DriveSession:
+class DriveSegment:
     """A part of a drive in which odometry was never lost."""
 
     first: int  # its first frame
@@ -130,12 +130,12 @@ class MappedSequence:
         return self.map.joined(self.session)
 
     @cached_property
-    def sessions(self) -> list[DriveSession]:
+    def sessions(self) -> list[DriveSegment]:
         """The parts of the drive between its breaks, in order."""
-        stretch = stretches(self.health)
-        parts = [np.flatnonzero(stretch == n) for n in range(int(stretch.max(initial=-1)) + 1)]
+        segment = segment_numbers(self.health)
+        parts = [np.flatnonzero(segment == n) for n in range(int(segment.max(initial=-1)) + 1)]
         return [
-            DriveSession(int(own[0]), int(own[-1]), len(own), bool(self.joined[own[0]]))
+            DriveSegment(int(own[0]), int(own[-1]), len(own), bool(self.joined[own[0]]))
             for own in parts
         ]
 

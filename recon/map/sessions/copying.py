@@ -21,7 +21,7 @@ from recon.map.store.records import Key
 from recon.map.store.session import AXES, ENTRY, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
 from recon.map.store.trees import FRAMES, RAYS, RIG
 from recon.map.submaps import Submap
-from recon.odometry.health import stretches
+from recon.odometry.health import segment_numbers
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.places import path_lengths
 
@@ -79,13 +79,13 @@ def join_parts(
         _append_submaps(session, part, lead, T_world_part, settings.fusion.voxel_m)
         poses = session.odometry.T_world_camera
         path_m = path_lengths(poses, session.trusted, settings.scale)
-        stretch = stretches(session.health)
+        segment = segment_numbers(session.health)
         for stored in part.keyframes:
             if stored.keyframe.frame >= lead:
                 frame = begin + stored.keyframe.frame
                 keyframe = replace(stored.keyframe, frame=frame)
                 pose, along_m = poses[frame], float(path_m[frame])
-                detector.look(StoredKeyframe(keyframe, pose, along_m, int(stretch[frame])))
+                detector.look(StoredKeyframe(keyframe, pose, along_m, int(segment[frame])))
 
 
 def read_all(map_: MapFile) -> None:

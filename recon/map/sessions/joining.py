@@ -25,7 +25,7 @@ from recon.core.values.arrays import Float64
 from recon.map.store.map_file import MapFile, MapViews
 from recon.map.store.session import ALONE, BENT, NO_LOOPS, Session
 from recon.map.store.trees import Link
-from recon.odometry.health import stretches
+from recon.odometry.health import segment_numbers
 from recon.places.closure import DrivePath, Tie, join_drives
 from recon.places.detector import KnownPlaces
 from recon.places.fixes import Held
@@ -168,7 +168,7 @@ def _between(map_: MapFile, group: Sequence[int], new: Session) -> list[Link]:
     for number in group:
         other = map_.session(number)
         shared = shared_frames(other, new).tolist()
-        ones, news = stretches(other.health), stretches(new.health)
+        ones, news = segment_numbers(other.health), segment_numbers(new.health)
         # One for each two stretches: nothing else may say where those behind a lost pose are.
         both = [(int(ones[first]), int(news[last]), first, last) for first, last in shared]
         last = {
@@ -196,7 +196,7 @@ def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Lin
         return []
     path_m, poses = path_up_to(new), new.odometry.T_world_camera
     # The other drives are finished: what they drifted is corrected as far as it is known.
-    of = stretches(new.health).tolist()
+    of = segment_numbers(new.health).tolist()
     firsts = {loop.first: (views[loop.first].T_world_camera, 0.0, 0) for loop in loops}
     lasts = {n: (poses[n], float(path_m[n]), of[n]) for n in {loop.last for loop in loops}}
     links = []

@@ -20,7 +20,7 @@ from recon.look.rig import KnownRig
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
 from recon.map.store.trees import LINKS, Link
-from recon.odometry.health import doubt_about, name_frames, stretches
+from recon.odometry.health import doubt_about, name_frames, segment_numbers
 from recon.places.detector import KnownPlaces, KnownView
 
 MAP_FILE: Final = "map/map.recon"  # where a finished run keeps its map
@@ -140,20 +140,20 @@ class MapFile:
     def placed(self) -> dict[int, Bool]:
         """Which frames of each linked drive, by its number, have a place in the map; bool (N,).
 
-        Those whose pose is to be trusted, of stretches that loops, links or measured positions hold
+        Those whose pose is to be trusted, of segments that loops, links or measured positions hold
         to the longest one of the first drive. Behind a lost pose odometry guesses, and a guess does
         not enter the map. Only these frames are in products, and to be recognised.
         """
         if not (sessions := self.linked):
             return {}
-        of = {session.number: stretches(session.health) for session in sessions}
+        of = {session.number: segment_numbers(session.health) for session in sessions}
         ties, first = [*_ties(sessions, self.links, of)], sessions[0].number
         held = {(first, int(np.bincount(of[first] + 1, minlength=2)[1:].argmax()))}
         while more := {b for tie in ties for a, b in (tie, tie[::-1]) if a in held} - held:
             held |= more
         return {
-            number: (stretch >= 0) & np.isin(stretch, [s for drive, s in held if drive == number])
-            for number, stretch in of.items()
+            number: (segment >= 0) & np.isin(segment, [s for drive, s in held if drive == number])
+            for number, segment in of.items()
         }
 
     def joined(self, session: Session) -> Bool:
@@ -161,11 +161,11 @@ class MapFile:
 
         Frames without a trusted pose go with those before them. All, if no pose is trusted.
         """
-        stretch, placed = stretches(session.health), self.placed[session.number]
-        last = np.maximum.accumulate(np.where(stretch >= 0, np.arange(len(stretch)), -1))
-        first = int(np.argmax(stretch >= 0))
+        segment, placed = segment_numbers(session.health), self.placed[session.number]
+        last = np.maximum.accumulate(np.where(segment >= 0, np.arange(len(segment)), -1))
+        first = int(np.argmax(segment >= 0))
         return np.asarray(
-            np.isin(stretch[np.maximum(last, first)], stretch[placed]) | ~placed.any()
+            np.isin(segment[np.maximum(last, first)], segment[placed]) | ~placed.any()
         )
 
     @property
@@ -211,31 +211,31 @@ class MapFile:
         self.close()
 
 
-_Stretch = tuple[int, int]
-"""Number of a drive, and of a stretch of it."""
-_SURVEY: Final[_Stretch] = (-1, -1)
-_FEWEST_FIXES: Final = 2  # measured positions that say where a stretch is, and which way it goes
+_Segment = tuple[int, int]
+"""Number of a drive, and of a segment of it."""
+_SURVEY: Final[_Segment] = (-1, -1)
+_FEWEST_FIXES: Final = 2  # measured positions that say where a segment is, and which way it goes
 
 
 def _ties(
     sessions: Sequence[Session], links: Sequence[Link], of: Mapping[int, Int64]
-) -> Iterator[tuple[_Stretch, _Stretch]]:
-    """Yield pairs of stretches that loops, links and measured positions hold together."""
+) -> Iterator[tuple[_Segment, _Segment]]:
+    """Yield pairs of segments that loops, links and measured positions hold together."""
 
-    def stretch(number: int, frame: int) -> _Stretch:
+    def segment(number: int, frame: int) -> _Segment:
         return number, int(of[number][frame])
 
     for session in sessions:
         number = session.number
         for loop in session.loops.get("closed", ()):
-            yield stretch(number, loop["first"]), stretch(number, loop["last"])
+            yield segment(number, loop["first"]), segment(number, loop["last"])
         measured, counts = np.unique(of[number][session.fixes.frames], return_counts=True)
         for one in measured[(measured >= 0) & (counts >= _FEWEST_FIXES)].tolist():
             yield (number, one), _SURVEY
     for link in links:
         if link.kept and set(link.sessions) <= set(of):
             one, other = link.sessions
-            yield stretch(one, link.loop.first), stretch(other, link.loop.last)
+            yield segment(one, link.loop.first), segment(other, link.loop.last)
 
 
 def known_places(map_: MapFile) -> KnownPlaces:

@@ -361,7 +361,7 @@ class Keyframes:
             "keyframe": asdict(stored.keyframe),
             "T_world_camera": stored.T_world_camera,
             "path_m": stored.path_m,
-            "stretch": stored.stretch,
+            "stretch": stored.segment,
             "loops": [asdict(loop) for loop in stored.loops],
             "refused": list(stored.refused),
         }
