@@ -54,7 +54,7 @@ class FittedFault:
 
     values: Float64
     covariance: Float64  # (P, P), mean squares of their errors, by shrinking as well
-    stretch: Float64  # (P,), by what share the path becomes longer with each
+    lengthening: Float64  # (P,), by what share the path becomes longer with each
     scatter: float  # how much more windows contradict each other than their features say, 1 or more
     windows: int
     late: float = 0.0  # frames by which right images are taken later than left ones
@@ -141,7 +141,7 @@ def fit_fault(
     own, shown, late, sigma = _without_late(values[active], shown, sigmas)
     moved = None if moved is None else moved[rig]
     values[:-1][rig], squares, spread = shrink(own, shown, sigmas[:-1], moved)
-    covariance[np.ix_(rig, rig)], stretch = squares, _stretch(found)[:-1]
+    covariance[np.ix_(rig, rig)], lengthening = squares, _lengthening(found)[:-1]
     fixed = not turns(tracks, fault, values[:-1])
     if not fixed:
         covariance += np.outer(values[:-1], values[:-1])
@@ -150,10 +150,10 @@ def fit_fault(
     # nothing is corrected of late images.
     used = np.append(values[:-1], 0.0)
     apart = disagreement([_corrected(part, part.window, fault, used)[1] for part in parts], camera)
-    length = float(np.sqrt(stretch @ covariance @ stretch + apart**2))
+    length = float(np.sqrt(lengthening @ covariance @ lengthening + apart**2))
     covariance[np.ix_(rig, rig)] += off[:-1, :-1]
     others = (late, sigma, spread, fixed, length)
-    return FittedFault(values[:-1], covariance, stretch, scatter, len(tracks), *others)
+    return FittedFault(values[:-1], covariance, lengthening, scatter, len(tracks), *others)
 
 
 def _by_likeness(
@@ -271,7 +271,7 @@ def _in_time(places: Places, window: TrackWindow, camera: RectifiedCamera, late:
     return Places(places.left_uv, places.right_uv - moved @ to_right.T, by_left, by_right)
 
 
-def _stretch(found: Sequence[tuple[TrackWindow, _System]]) -> Float64:
+def _lengthening(found: Sequence[tuple[TrackWindow, _System]]) -> Float64:
     """Return by what share the path of all windows becomes longer with each parameter (P,)."""
     ends = [window.T_world_camera[[0, -1]] for window, _ in found]
     # In the axes of the last frame.

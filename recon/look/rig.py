@@ -116,7 +116,7 @@ class RefinedRig:
         """
         if self.fitted is None:
             return None
-        by, own = self.fitted.stretch, self.fitted.length
+        by, own = self.fitted.lengthening, self.fitted.length
         if np.isnan(own):  # fitted by an earlier version
             own = float(np.sqrt(by @ self.fitted.covariance @ by))
         kept = 0.0 if self.refined else float(by @ self.fitted.values)

@@ -348,7 +348,7 @@ def test_a_path_becomes_longer_with_a_fault_as_is_said(values):
     paths = [adjust(part.window, CAMERA).T_world_camera[-1, :3, 3] for part in windows]
     longer = 1.0 - np.linalg.norm(paths, axis=1).mean() / (FRAMES - 1)
     assert abs(longer) > 3e-4
-    assert found.stretch @ values == pytest.approx(longer, rel=0.2)
+    assert found.lengthening @ values == pytest.approx(longer, rel=0.2)
 
 
 def with_lens(**changes: object) -> StereoCalibration:
