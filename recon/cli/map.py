@@ -195,7 +195,9 @@ def merge(
     out: opt.Out = None,
     georeference: Annotated[
         Path | None,
-        opt.option("Measured positions, which the paths are bent to run through." + opt.POSITIONS),
+        opt.option(
+            "Measured positions, which the paths are optimised to run through." + opt.POSITIONS
+        ),
     ] = None,
     antenna: opt.Antenna = None,
     mesh: opt.Mesh = True,

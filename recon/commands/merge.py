@@ -60,7 +60,7 @@ def run_merge(
         runs: Folders of finished runs; the world and the axes of the first are those of the map.
         config: Settings of the first run with changes; None = its own.
         options: Folder, threads and mesh of the run; None = the defaults.
-        survey: Positions that were measured during drives, whose paths are bent to run through
+        survey: Positions that were measured during drives, whose paths are optimised to run through
             them; None = none.
 
     Returns:

@@ -24,7 +24,7 @@ class SubmapSettings(Settings):
     """
 
     length_m: float = Length(25.0, ge=1e-06, le=100_000.0)
-    """Path after which a new submap begins. Shorter ones bend better with closed loops and take
+    """Path after which a new submap begins. Shorter ones follow closed loops better and take
     less memory."""
     tile_m: float = Length(50.0, ge=1e-06, le=100_000.0)
     """Edge of the tiles, rounded to whole voxels. Smaller ones take less memory, and more time."""

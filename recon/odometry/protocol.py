@@ -35,7 +35,7 @@ class OdometryHealth:
     # True where nothing says where this frame lies beside those before; later ones are measured
     # from it
     begins: bool = False
-    known: bool = False  # True where the pose was given, not measured: nothing later bends it
+    known: bool = False  # True where the pose was given, not measured: nothing later changes it
     tracks: int = 0  # features followed from the last frame
     inliers: int = 0  # features that agree with the visual motion
     reprojection_px: float = float("nan")  # their median reprojection error

@@ -29,10 +29,10 @@ from recon.places.closure import (
     USUAL,
     Closure,
     DrivePath,
-    bend_path,
     longest_segment,
     nodes_along,
     odometry_edges,
+    optimise_path,
 )
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import feature_sigma_px
@@ -113,7 +113,7 @@ def adjust_path(
     if not test.cost(after) < test.cost(before):
         return None
     return Adjustment(
-        bend_path(path, nodes, T_world_node),
+        optimise_path(path, nodes, T_world_node),
         len(np.unique(known.seen.node)),
         known.seen.points,
         _median_px(test, before),

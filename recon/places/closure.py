@@ -37,7 +37,9 @@ _LOOP_SIGMA_DEG: Final = 0.1  # as the first, of its rotation
 _MAX_CHI2: Final = 22.5
 """Chi-square at which the weight of a loop is a quarter: 0.1 % of right ones are beyond."""
 
-_MAX_BEND_CHI2: Final = 6.0  # mean chi-square of the odometry edges above which no loop is believed
+_MAX_DEFORMATION_CHI2: Final = (
+    6.0  # mean chi-square of the odometry edges above which no loop is believed
+)
 USUAL: Final = 0.3
 """What odometry usually drifts, as a share of what it may: measured positions, whose errors do not
 grow, would make a path as rough as they are if it counted for less."""
@@ -113,7 +115,7 @@ def close_loops(path: DrivePath, loops: Sequence[Loop]) -> Closure:
         tuple(loop for loop, kept in zip(loops, believed, strict=True) if kept == side)
         for side in (True, False)
     )
-    if (joined.kept & ~believed).any():  # what is not believed must not bend the path
+    if (joined.kept & ~believed).any():  # what is not believed must not deform the path
         again = close_loops(path, closed)
         return replace(again, refused=(*again.refused, *refused))
     return Closure(joined.trajectories[0], closed, refused)
@@ -171,12 +173,14 @@ def join_drives(
             poses, weights = _solve_held(drives, nodes, begun, steps, edges, held)
     except RegistrationError:
         return None
-    bends = [np.mean([misfit(edge, poses) for edge in chain]) for chain in chains if chain]
+    deformations = [np.mean([misfit(edge, poses) for edge in chain]) for chain in chains if chain]
     kept = weights >= _KEPT
-    if share**2 * max(bends, default=0.0) > _MAX_BEND_CHI2 or (ties and not kept.any()):
+    if share**2 * max(deformations, default=0.0) > _MAX_DEFORMATION_CHI2 or (
+        ties and not kept.any()
+    ):
         return None
     solved = [poses[a:b] for a, b in pairwise(begins)]
-    paths = [bend_path(*each) for each in zip(drives, nodes, solved, strict=True)]
+    paths = [optimise_path(*each) for each in zip(drives, nodes, solved, strict=True)]
     return JoinedDrives(tuple(paths), kept)
 
 
@@ -346,7 +350,7 @@ def _inverse(covariance: Float64) -> Float64:
     return np.asarray(np.linalg.inv(covariance), np.float64)
 
 
-def bend_path(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:
+def optimise_path(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:
     """Return every pose moved with the nodes before and after it, interpolated by distance."""
     old, path_m = drive.trajectory.T_world_camera, drive.path_m
     before = np.searchsorted(nodes, np.arange(len(old)), side="right") - 1

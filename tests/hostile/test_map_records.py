@@ -24,7 +24,7 @@ from recon.map.map import Map
 from recon.map.occupancy.part import OccupancyPart, SurfacePoints, join_occupancy
 from recon.map.store.map_file import MapViews
 from recon.map.store.records import Key, Store
-from recon.map.store.session import ALONE, BENT, SessionInfo
+from recon.map.store.session import OPTIMISED_POSES, POSES_BEFORE_LINKS, SessionInfo
 from recon.map.store.trees import Link
 from recon.map.submaps import Submap
 from recon.odometry.protocol import OdometryHealth
@@ -73,7 +73,9 @@ def _add_drive(map_: Map) -> None:
     occupancy = OccupancyPart(rows, SurfacePoints(KEYS, np.ones((2, 5), np.float32)))
     session.submaps.add(Submap(0, 0, FRAMES, fused, occupancy))
     path = np.stack([np.eye(4)] * FRAMES)
-    session.set_loops({"closed": [asdict(LOOP)], "refused": [], BENT: path, ALONE: path})
+    session.set_loops(
+        {"closed": [asdict(LOOP)], "refused": [], OPTIMISED_POSES: path, POSES_BEFORE_LINKS: path}
+    )
     frames, places_m = np.arange(3, dtype=np.int32), np.zeros((3, 3))
     session.set_fixes(Fixes(frames, places_m, places_m, 0.1))
 

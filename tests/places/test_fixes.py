@@ -42,7 +42,7 @@ def held(odometry: Trajectory, fixes: Fixes) -> JoinedDrives | None:
     return join_drives([drive_path(odometry)], [], Held(about, [fixes]))
 
 
-def bend_m(path: Trajectory, truth: Trajectory) -> float:
+def median_m(path: Trajectory, truth: Trajectory) -> float:
     """Largest distance from the truth, moved rigidly to where it fits best."""
     moved = fit_points(path.positions_m, truth.positions_m).move(path)
     return float(np.linalg.norm(moved.positions_m - truth.positions_m, axis=1).max())
@@ -50,8 +50,8 @@ def bend_m(path: Trajectory, truth: Trajectory) -> float:
 
 def test_a_path_runs_through_measured_positions(truth: Trajectory, odometry: Trajectory) -> None:
     found = held(odometry, measured(truth, 0.01))
-    assert bend_m(odometry, truth) > 1.0
-    assert bend_m(found.trajectories[0], truth) < 0.1
+    assert median_m(odometry, truth) > 1.0
+    assert median_m(found.trajectories[0], truth) < 0.1
     first = found.trajectories[0].T_world_camera[0]
     np.testing.assert_array_equal(first, odometry.T_world_camera[0])
 

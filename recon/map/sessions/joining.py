@@ -23,7 +23,7 @@ from recon.core.geometry.se3 import apply, invert, orthonormalise
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.store.map_file import MapFile, MapViews
-from recon.map.store.session import ALONE, BENT, NO_LOOPS, Session
+from recon.map.store.session import NO_LOOPS, OPTIMISED_POSES, POSES_BEFORE_LINKS, Session
 from recon.map.store.trees import Link
 from recon.odometry.health import segment_numbers
 from recon.places.closure import DrivePath, Tie, join_drives
@@ -47,14 +47,14 @@ def join_sessions(map_: MapFile, links: Sequence[Link]) -> None:
     """Place the drives that links hold together; keep the links, and which drives those are.
 
     The first drive stays where it is, and its axes are those of the map. Drives that no link holds
-    stay apart. Paths along which positions were measured are bent to run through them.
+    stay apart. Paths along which positions were measured are optimised to run through them.
     """
     paths, believed = _held_together(map_, links)
     for session in map_.sessions:
         if session.number in paths:
             _place(map_, session, paths[session.number])
-        elif ALONE in session.loops:
-            session.set_loops({**session.loops, BENT: session.loops[ALONE]})
+        elif POSES_BEFORE_LINKS in session.loops:
+            session.set_loops({**session.loops, OPTIMISED_POSES: session.loops[POSES_BEFORE_LINKS]})
     kept, linked = set(map(id, believed)), paths or [map_.sessions[0].number]
     map_.set_links([replace(link, kept=id(link) in kept) for link in links], [*linked])
 
@@ -221,7 +221,7 @@ def _held_together(
         paths, believed = _solve(map_, places, inside)
         if not paths and not inside:
             raise RegistrationError(
-                "measured positions bend a path more than its drift explains",
+                "measured positions deform a path more than its drift explains",
                 where=", ".join(map_.session(number).info.source for number in places),
                 hint="have they its clock, metres, and the offset of the antenna?",
             )
@@ -318,12 +318,12 @@ def _held(map_: MapFile, sessions: Sequence[Session], drives: Sequence[DrivePath
 
 
 def _place(map_: MapFile, session: Session, path: Trajectory) -> None:
-    """Write where a drive is: its axes, and how its path is bent."""
+    """Write where a drive is: its axes, and how its path is optimised."""
     T_world_session = path.T_world_camera[0] @ invert(session.odometry.T_world_camera[0])
-    bent = invert(T_world_session) @ path.T_world_camera
+    optimised = invert(T_world_session) @ path.T_world_camera
     loops = {**NO_LOOPS, **session.loops}
-    alone = loops.get(ALONE, loops[BENT])
-    session.set_loops({**loops, ALONE: alone, BENT: bent})
+    before = loops.get(POSES_BEFORE_LINKS, loops[OPTIMISED_POSES])
+    session.set_loops({**loops, POSES_BEFORE_LINKS: before, OPTIMISED_POSES: optimised})
     first = map_.sessions[0]
     if session is not first:
         session.set_axes(first.T_map_world @ T_world_session, session.camera)

@@ -48,7 +48,7 @@ _LEAST_BEND_M: Final = 0.1
 """Positions of so many places, and so far from a straight line, tell left from right."""
 _NAMED: Final = 3
 _LEAST_SIGMA_M: Final = 0.01  # however smooth positions are, no antenna is known better
-_SIGMA_OF_BEND: Final = 1.4826 / np.sqrt(6.0)
+_SIGMA_OF_CURVATURE: Final = 1.4826 / np.sqrt(6.0)
 """Standard deviation of errors, by the median of how far they are from a line through three."""
 
 
@@ -153,7 +153,7 @@ class Measured:
 
     @property
     def sigma_m(self) -> Float64:
-        """float64 (N,), standard deviation of a coordinate, as the path is bent by it.
+        """float64 (N,), standard deviation of a coordinate, as the path is optimised by it.
 
         What many in a row are off by, or by more and more, cannot be told from drift of the path:
         that is for the file to say. Where it says, its own differences count.
@@ -176,9 +176,9 @@ class Measured:
     @property
     def uneven_m(self) -> float:
         """Standard deviation of a coordinate, by how evenly the positions differ from the path."""
-        bends_m = np.abs(np.diff(self.misfit_m[self.agree], n=2, axis=0))
-        bend_m = float(np.median(bends_m)) if len(bends_m) else 0.0
-        return float(_SIGMA_OF_BEND * bend_m)
+        curvature_m = np.abs(np.diff(self.misfit_m[self.agree], n=2, axis=0))
+        median_m = float(np.median(curvature_m)) if len(curvature_m) else 0.0
+        return float(_SIGMA_OF_CURVATURE * median_m)
 
     def check(self, drift_m: float, where: Path) -> None:
         """Refuse positions that neither the drift of the path nor their noise explains."""
@@ -211,7 +211,7 @@ class Measured:
         return [*late, *self._left_out(), *self._swapped()]
 
     def _swapped(self) -> list[str]:
-        """Return a line if the path, which may bend left or right, is that of a mirror image."""
+        """Return a line if the path, which may curve left or right, is that of a mirror image."""
         ours_m, position_m = self.ours_m[self.agree], self.position_m[self.agree]
         if len(ours_m) < _FEWEST_TO_BEND:
             return []
@@ -316,7 +316,7 @@ def fixed_turn(
 def hold(map_: MapFile, survey: Survey) -> list[str]:
     """Keep what was measured during any drive of a map with that drive; returns warnings.
 
-    `join_sessions` then bends their paths to run through these positions.
+    `join_sessions` then optimises their paths to run through these positions.
     """
     times_s, lines = survey.rows[:, 0], list[str]()
     sessions = [each for each in map_.sessions if _during(_trusted_path(each), times_s).any()]

@@ -45,10 +45,10 @@ SESSION: Final = "session"
 AXES: Final = "axes"
 IMAGES: Final = "images"  # path and kind of the source, and its `mark_of`
 LOOPS: Final = "loops"
-BENT: Final = "T_world_camera"
+OPTIMISED_POSES: Final = "T_world_camera"
 """The path of a drive after loops, links and measured positions; None = that of odometry."""
-ALONE: Final = "T_alone_camera"  # the same before links to other drives bent it
-NO_LOOPS: Final[Mapping[str, Any]] = {"closed": [], "refused": [], BENT: None}
+POSES_BEFORE_LINKS: Final = "T_alone_camera"  # the same before links to other drives optimised them
+NO_LOOPS: Final[Mapping[str, Any]] = {"closed": [], "refused": [], OPTIMISED_POSES: None}
 """What a map keeps of a drive without loops, if it keeps anything else with them."""
 _STATE: Final = "state"
 
@@ -123,7 +123,7 @@ class Session:
     @property
     def trajectory(self) -> Trajectory:
         """The path after loop closure; that of odometry if no loop was closed."""
-        closed = self.loops.get(BENT)
+        closed = self.loops.get(OPTIMISED_POSES)
         return self.odometry if closed is None else Trajectory(closed, np.array(self._times_s))
 
     @property
@@ -162,7 +162,7 @@ class Session:
         """Return float64 (S, 4, 4), by what loops move each submap; None = nothing moves."""
         with reading(self._store.name):
             closure, odometry = Closure(self.trajectory, (), ()), self.odometry
-            if self.loops.get(BENT) is None:
+            if self.loops.get(OPTIMISED_POSES) is None:
                 return None
             entries = self.submaps.entries
             return np.stack([closure.correction(odometry, one.middle) for one in entries])
@@ -256,7 +256,7 @@ class Session:
             raise FormatError("frames of the drive are not in order")
 
     def _check_loops(self) -> None:
-        for name in (BENT, ALONE):
+        for name in (OPTIMISED_POSES, POSES_BEFORE_LINKS):
             if (poses := self.loops.get(name)) is not None:
                 path_of(poses, np.array(self._times_s))
         for tree in self.loops.get("closed", ()):

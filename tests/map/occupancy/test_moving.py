@@ -386,7 +386,7 @@ def _at_random(share: float) -> np.ndarray:
 SINCE = np.arange(LOOKS)[:, None] - 2 * WALL[:, 0]
 BOARDS = np.random.default_rng(3).random((LOOKS, 8)) < 0.3
 BODY = _while(slice(5, 9), len(WALL))
-ALONE = _while(slice(3, 5), 1)
+POSES_BEFORE_LINKS = _while(slice(3, 5), 1)
 
 
 @pytest.mark.parametrize(("seen", "moved"), [
@@ -399,9 +399,9 @@ ALONE = _while(slice(3, 5), 1)
     (np.where(BOARDS[:, WALL[:, 0]], 1, -1), False),
     *((np.full((LOOKS, len(WALL)), always), False) for always in (-1, 0, 1)),
     # One cell alone: hit in one run of frames, in two, or never looked through.
-    (ALONE, True),
-    (np.maximum(ALONE, _while(slice(9, 10), 1)), False),
-    (np.maximum(ALONE, 0), False),
+    (POSES_BEFORE_LINKS, True),
+    (np.maximum(POSES_BEFORE_LINKS, _while(slice(9, 10), 1)), False),
+    (np.maximum(POSES_BEFORE_LINKS, 0), False),
 ])  # fmt: skip
 def test_what_was_there_as_a_whole_for_a_while_moved(seen, moved):
     assert (_judged(WALL[: seen.shape[1]], seen) == moved).all()
