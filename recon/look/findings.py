@@ -13,7 +13,7 @@ from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.look.look import Look
 from recon.look.measures import MIN_FEATURES, Gaps
-from recon.look.rig import LATER, MOST_LATE, MOVES, RefinedRig
+from recon.look.rig import LATER, MOST_TIME_OFFSET, MOVES, RefinedRig
 from recon.look.sample import BLANK_DN, Sample
 from recon.look.settings import AuditedSettings
 from recon.stereo.match.protocol import Matcher
@@ -156,26 +156,26 @@ def _of_series(sample: Sample, gaps: Gaps) -> Found:
 
 def _of_geometry(look: Look) -> Found:
     geometry, skew = look.geometry, look.skew
-    swapped, lag = geometry.swapped_share, geometry.lag
+    swapped, offset = geometry.swapped_share, geometry.offset
     if look.shifted:
         yield "lag shifted", {"fatal": False, "paired": look.first[0]}
     if swapped >= _SWAPPED_SHARE:
         yield "swapped", {"percent": 100 * swapped}
-    if lag:
-        shift = look.source.shift_of(lag)
+    if offset:
+        shift = look.source.shift_of(offset)
         in_step = f"--set source.shift_frames={shift} pairs the images that belong together"
         yield (
             "lag",
             {
-                "late": "right" if lag > 0 else "left",
-                "frames": counted(abs(lag), "frame"),
+                "late": "right" if offset > 0 else "left",
+                "frames": counted(abs(offset), "frame"),
                 "in_step": "pair the images by timestamp" if shift is None else in_step,
             },
         )
-    elif skew is not None and abs(skew[0]) > max(MOST_LATE, 4 * skew[1]):
+    elif skew is not None and abs(skew[0]) > max(MOST_TIME_OFFSET, 4 * skew[1]):
         yield "skew", {"skew": skew[0]}
     rows = geometry.alignment
-    if lag:  # rows say nothing of the cameras then
+    if offset:  # rows say nothing of the cameras then
         return
     if look.rig.not_rigid:
         yield "nonrigid", {"found": look.rig.not_rigid[0]}

@@ -57,8 +57,8 @@ class FittedFault:
     lengthening: Float64  # (P,), by what share the path becomes longer with each
     scatter: float  # how much more windows contradict each other than their features say, 1 or more
     windows: int
-    late: float = 0.0  # frames by which right images are taken later than left ones
-    late_sigma: float = float("nan")
+    time_offset: float = 0.0  # frames by which right images are taken later than left ones
+    time_offset_sigma: float = float("nan")
     spread: float = 1.0  # variance of what lenses bend, in that expected beforehand, 1 or more
     fixed: bool = True  # False: it turns with what is seen, as in stabilised images
     # standard deviation of the path's length without the fault, as a share; NaN = as the covariance
@@ -138,7 +138,7 @@ def fit_fault(
         for part, window in zip(tracks, windows, strict=True)
     ]
     off = _by_likeness(parts, fault, values, active, (held + prior) * scatter)
-    own, shown, late, sigma = _without_late(values[active], shown, sigmas)
+    own, shown, time_offset, sigma = _without_time_offset(values[active], shown, sigmas)
     moved = None if moved is None else moved[rig]
     values[:-1][rig], squares, spread = shrink(own, shown, sigmas[:-1], moved)
     covariance[np.ix_(rig, rig)], lengthening = squares, _lengthening(found)[:-1]
@@ -152,7 +152,7 @@ def fit_fault(
     apart = disagreement([_corrected(part, part.window, fault, used)[1] for part in parts], camera)
     length = float(np.sqrt(lengthening @ covariance @ lengthening + apart**2))
     covariance[np.ix_(rig, rig)] += off[:-1, :-1]
-    others = (late, sigma, spread, fixed, length)
+    others = (time_offset, sigma, spread, fixed, length)
     return FittedFault(values[:-1], covariance, lengthening, scatter, len(tracks), *others)
 
 
@@ -191,7 +191,7 @@ def _without_quarters(window: TrackWindow, camera: RectifiedCamera) -> Iterator[
         yield from (np.setdiff1d(np.arange(len(key)), quarter) for quarter in quarters)
 
 
-def _without_late(
+def _without_time_offset(
     values: Float64, shown: Float64, sigmas: Float64
 ) -> tuple[Float64, Float64, float, float]:
     """Return the parameters but the last one, and their information; that one apart.
@@ -200,11 +200,16 @@ def _without_late(
     to nothing, cameras have one trigger, and the others are stated as if it were nothing.
     """
     known = shown + np.diag(1.0 / sigmas**2)
-    late, sigma = float(values[-1]), float(np.sqrt(np.linalg.inv(known)[-1, -1]))
+    time_offset, sigma = float(values[-1]), float(np.sqrt(np.linalg.inv(known)[-1, -1]))
     rig, shared = shown[:-1, :-1], known[:-1, -1]
-    if abs(late) < max(_IN_STEP, 2.0 * sigma):
-        return values[:-1] + np.linalg.solve(known[:-1, :-1], shared) * late, rig, late, sigma
-    return values[:-1], rig - np.outer(shared, shared) / known[-1, -1], late, sigma
+    if abs(time_offset) < max(_IN_STEP, 2.0 * sigma):
+        return (
+            values[:-1] + np.linalg.solve(known[:-1, :-1], shared) * time_offset,
+            rig,
+            time_offset,
+            sigma,
+        )
+    return values[:-1], rig - np.outer(shared, shared) / known[-1, -1], time_offset, sigma
 
 
 def _information(H: Float64, sigmas: Float64) -> Float64:
@@ -253,7 +258,9 @@ def _scatter(known: Float64, total: Float64, g: Float64) -> float:
     return max(1.0, float(varied / np.trace(inverse @ total)))
 
 
-def _in_time(places: Places, window: TrackWindow, camera: RectifiedCamera, late: float) -> Places:
+def _in_time(
+    places: Places, window: TrackWindow, camera: RectifiedCamera, time_offset: float
+) -> Places:
     """Return where features would be seen if right images were not late, with one parameter more.
 
     Ref: Qin and Shen, "Online temporal calibration for monocular visual-inertial systems", 2018.
@@ -262,9 +269,12 @@ def _in_time(places: Places, window: TrackWindow, camera: RectifiedCamera, late:
     step = np.gradient(xyz, axis=0, edge_order=2)
     seen, later = (
         np.stack(project(at.reshape(-1, 3), camera), axis=-1).reshape(xyz.shape)
-        for at in (xyz, xyz + late * step)
+        for at in (xyz, xyz + time_offset * step)
     )
-    moved, motion = later - seen, (_derivative(xyz + late * step, camera) @ step[..., None])[..., 0]
+    moved, motion = (
+        later - seen,
+        (_derivative(xyz + time_offset * step, camera) @ step[..., None])[..., 0],
+    )
     to_right = np.array([[1.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # of column, row and disparity
     by_left = np.concatenate([places.by_left, np.zeros((*motion.shape[:2], 2, 1))], axis=-1)
     by_right = np.concatenate([places.by_right, -(motion @ to_right.T)[..., None]], axis=-1)

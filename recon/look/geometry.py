@@ -11,13 +11,13 @@ import numpy as np
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.look.measures import LARGEST_SKEW, MIN_FEATURES, align_features, time_skew
-from recon.look.sample import Lagged, Sample
+from recon.look.sample import Sample, Shifted
 from recon.stereo.rectify.features import PairFeatures, inspect_features, pool_features
 from recon.stereo.rectify.row_alignment import RowAlignment, align_rows
 
-_ByLag = Mapping[int, Sequence[Lagged]]
-_LAG_FACTOR: Final = 1.25  # agreement relative to lag 0 from which a delay is reported
-_ALIKE: Final = 1.5  # agreement of the best lag relative to another that fits about as well
+_ByOffset = Mapping[int, Sequence[Shifted]]
+_OFFSET_FACTOR: Final = 1.25  # agreement relative to offset 0 from which a delay is reported
+_ALIKE: Final = 1.5  # agreement of the best offset relative to another that fits about as well
 MOST_ROWS_PX: Final = 1.5
 """Epipolar error from which a pair is not matched rightly. As far as cameras turn against each
 other up and down, they turn to the side, which shifts every disparity and is seen nowhere."""
@@ -30,13 +30,13 @@ class Geometry:
     """Stereo geometry measured from the features of a drive."""
 
     pairs: int  # whose features were matched
-    features: PairFeatures  # of all pairs; if one camera is delayed, of pairs shifted by the lag
+    features: PairFeatures  # of all pairs; if one camera is delayed, of pairs shifted by the offset
     matched: int  # number of features matched in pairs as recorded
     alignment: RowAlignment | None  # row errors; None if there are too few features
     disparity_px: Float64  # (M,), of the features whose rows agree; 0 is at infinity
     swapped_share: float  # of near features, farther right in the right image; NaN = too few
     out_of_step: bool  # whether images of other moments fit better
-    lag: int  # delay of the right camera in whole frames
+    offset: int  # delay of the right camera in whole frames
     # its delay in parts of a frame, and the standard error; None if unknown, or whole frames
     skew: tuple[float, float] | None
 
@@ -44,13 +44,13 @@ class Geometry:
 def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
     """Measure the geometry from the features of all pairs."""
     each = [features for features, _ in sample.matched]
-    features, lagged = pool_features(each), sample.lagged
+    features, by_offset = pool_features(each), sample.by_offset
     matched = len(features)
     alignment = align_features(features, camera)
     skew = time_skew(each, [flow for _, flow in sample.matched], camera, alignment)
-    lag = _best_lag(lagged, skew, camera)
-    if lag:
-        features, skew = pool_features(one.features for one in lagged[lag]), None
+    offset = _best_offset(by_offset, skew, camera)
+    if offset:
+        features, skew = pool_features(one.features for one in by_offset[offset]), None
         alignment = align_features(features, camera)
     return Geometry(
         pairs=len(each),
@@ -59,8 +59,8 @@ def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
         alignment=alignment,
         disparity_px=_disparities(features, alignment, camera),
         swapped_share=inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share,
-        out_of_step=bool(lag) or _best_fit(lagged)[1] > _LAG_FACTOR,
-        lag=lag,
+        out_of_step=bool(offset) or _best_fit(by_offset)[1] > _OFFSET_FACTOR,
+        offset=offset,
         skew=skew,
     )
 
@@ -75,44 +75,46 @@ def _disparities(
     return shift[np.abs(rows) < max(1.0, 3 * alignment.residual_px)].astype(np.float64)
 
 
-def _best_lag(lagged: _ByLag, skew: tuple[float, float] | None, camera: RectifiedCamera) -> int:
-    """Return the lag that fits best, if it fits clearly better than none.
+def _best_offset(
+    by_offset: _ByOffset, skew: tuple[float, float] | None, camera: RectifiedCamera
+) -> int:
+    """Return the offset that fits best, if it fits clearly better than none.
 
     A delay of half a frame fits both neighbours badly; it is a skew, which moving features show.
     """
-    best, times = _best_fit(lagged)
-    best = _best_moving(lagged, best, camera)
+    best, times = _best_fit(by_offset)
+    best = _best_moving(by_offset, best, camera)
     if abs(best) == 1:
-        found, flows, _ = zip(*lagged[best], strict=True)
+        found, flows, _ = zip(*by_offset[best], strict=True)
         left = time_skew(found, flows, camera, align_features(pool_features(found), camera))
         if left is not None:
             return best if abs(left[0]) < 1 - LARGEST_SKEW else 0
         if skew is not None and 4 * skew[1] < abs(skew[0]) < LARGEST_SKEW:
             return 0
-    return best if times > _LAG_FACTOR else 0
+    return best if times > _OFFSET_FACTOR else 0
 
 
-def _best_moving(lagged: _ByLag, best: int, camera: RectifiedCamera) -> int:
-    """Return of the lags that fit about as well as the best one that at which moving rows do best.
+def _best_moving(by_offset: _ByOffset, best: int, camera: RectifiedCamera) -> int:
+    """Return of the offsets that fit about as well as the best one that at which moving rows do best.
 
     Where little moves, or what is ahead comes nearer, neighbouring frames match as well.
     """
-    fit = {lag: sum(n.agreeing for n in at) / len(at) for lag, at in lagged.items()}
+    fit = {offset: sum(n.agreeing for n in at) / len(at) for offset, at in by_offset.items()}
     sigmas = {}
-    for lag in (lag for lag in fit if _ALIKE * fit[lag] >= fit[best]):
-        found, flows, _ = zip(*lagged[lag], strict=True)
+    for offset in (offset for offset in fit if _ALIKE * fit[offset] >= fit[best]):
+        found, flows, _ = zip(*by_offset[offset], strict=True)
         skew = time_skew(found, flows, camera, align_features(pool_features(found), camera))
         if skew is not None and abs(skew[0]) < 1 - LARGEST_SKEW:
-            sigmas[lag] = skew[1]
-    return min(sigmas, key=lambda lag: sigmas[lag], default=best)
+            sigmas[offset] = skew[1]
+    return min(sigmas, key=lambda offset: sigmas[offset], default=best)
 
 
-def _best_fit(lagged: _ByLag) -> tuple[int, float]:
-    """Return the lag that fits best, and how many times as well as none; 1 if few features do."""
+def _best_fit(by_offset: _ByOffset) -> tuple[int, float]:
+    """Return the offset that fits best, and how many times as well as none; 1 if few features do."""
     # Lags were tried on different numbers of pairs.
-    total = {lag: sum(n.agreeing for n in at) for lag, at in lagged.items()}
-    fit = {lag: number / len(lagged[lag]) for lag, number in total.items()}
-    best = max(fit, key=lambda lag: (fit[lag], -abs(lag)), default=0)
+    total = {offset: sum(n.agreeing for n in at) for offset, at in by_offset.items()}
+    fit = {offset: number / len(by_offset[offset]) for offset, number in total.items()}
+    best = max(fit, key=lambda offset: (fit[offset], -abs(offset)), default=0)
     if total.get(best, 0) < MIN_FEATURES:
         return best, 1.0
     return best, fit[best] / max(fit.get(0, 0.0), 1.0)

@@ -63,7 +63,9 @@ class Look:
     def skew(self) -> tuple[float, float] | None:
         """Frames by which right images are late, and the standard error: by motion, else rows."""
         fitted = self.rig.fitted
-        return self.geometry.skew if fitted is None else (fitted.late, fitted.late_sigma)
+        return (
+            self.geometry.skew if fitted is None else (fitted.time_offset, fitted.time_offset_sigma)
+        )
 
     @property
     def first(self) -> tuple[str, ...]:
@@ -108,12 +110,12 @@ def look_at(
     if found.geometry.out_of_step and extent is QUICK:
         # A few pairs do not tell whole frames from half a frame, or chance.
         found = looked(source, extent=THOROUGH)
-    lag = found.geometry.lag
-    shifted = source.shifted(lag) if lag else None
+    offset = found.geometry.offset
+    shifted = source.shifted(offset) if offset else None
     if shifted is None:
         return found
     again = looked(shifted, extent=extent)
-    return found if again.geometry.out_of_step else replace(again, shifted=lag)
+    return found if again.geometry.out_of_step else replace(again, shifted=offset)
 
 
 def _looked(

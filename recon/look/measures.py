@@ -26,7 +26,7 @@ _MIN_POINTS: Final = 20
 _MIN_DISPARITY_PX: Final = 2.0
 _AGREE_PX: Final = 2.0
 MIN_FEATURES: Final = 60  # minimum number of features, in all, to judge geometry
-LARGEST_SKEW: Final = 0.75  # a larger skew, in frames, is closer to a lag of one frame
+LARGEST_SKEW: Final = 0.75  # a larger skew, in frames, is closer to an offset of one frame
 _IN_STEP: Final = 0.8  # share of features that agree on one rotation, of images of one moment
 _MIN_FLOW_PX: Final = 1.0  # rows per frame by which features must move to reveal a time skew
 

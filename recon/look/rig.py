@@ -47,7 +47,7 @@ _FIELD: Final = (16, 8)  # places across and down the image at which rigs are co
 MOST_DEPTH_PERCENT: Final = 2.0
 """Error of the depth from which the rig given is called wrong."""
 LEAST_FRAMES: Final = MIN_WINDOWS * FRAMES  # of a drive whose rig is refined
-MOST_LATE: Final = 0.1  # frames from which right images are said to be late
+MOST_TIME_OFFSET: Final = 0.1  # frames from which right images are said to be late
 LATER: Final = "after the left ones"  # in what is said of them
 MOVES: Final = (
     "what is wrong with the rig moves with what is seen instead of staying in the image, as in "
@@ -186,11 +186,13 @@ class RefinedRig:
     def late(self) -> str:
         """By how much right images are taken later than left ones, in words; "" if hardly."""
         fitted = self.fitted
-        if fitted is None or not abs(fitted.late) > max(MOST_LATE, 4.0 * fitted.late_sigma):
+        if fitted is None or not abs(fitted.time_offset) > max(
+            MOST_TIME_OFFSET, 4.0 * fitted.time_offset_sigma
+        ):
             return ""
-        frames = f"{fitted.late:+.2f} ± {1.96 * fitted.late_sigma:.2f} frames"
+        frames = f"{fitted.time_offset:+.2f} ± {1.96 * fitted.time_offset_sigma:.2f} frames"
         known = np.isfinite(self.period_s)
-        return frames + (f" ({1e3 * self.period_s * fitted.late:+.0f} ms)" if known else "")
+        return frames + (f" ({1e3 * self.period_s * fitted.time_offset:+.0f} ms)" if known else "")
 
     def figures(self) -> dict[str, Any]:
         """Return what differs, ready for ``summary.json``; parameters in radians and shares.
@@ -216,10 +218,10 @@ class RefinedRig:
                 "rms": self.changes[-1].rms_px,
             },
             "rows_px": self.changes[-1].rows_rms_px,
-            "right_late": {
-                "frames": self.fitted.late,
-                "sigma": self.fitted.late_sigma,
-                "seconds": self.period_s * self.fitted.late,
+            "right_time_offset": {
+                "frames": self.fitted.time_offset,
+                "sigma": self.fitted.time_offset_sigma,
+                "seconds": self.period_s * self.fitted.time_offset,
             },
             "depth_percent": {
                 f"{change.depth_m:g}": {"mean": mean, "sigma": sigma}
@@ -282,7 +284,7 @@ class KnownRig:
     def begun(self, settings: RectificationSettings) -> RefinedRig:
         """Return what another drive of the rig begins with, whose cameras run anew."""
         rig, none = self.described(settings), float("nan")
-        fitted = replace(self.fitted, late=none, late_sigma=none, fixed=True)
+        fitted = replace(self.fitted, time_offset=none, time_offset_sigma=none, fixed=True)
         return replace(rig, fitted=fitted, begun_with=self.name)
 
 

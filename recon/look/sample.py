@@ -40,15 +40,19 @@ class Extent:
     frames: int  # that are read in all
     pairs: int  # in which features are matched
     features: int  # at most, per image
-    lag: int  # largest delay of one camera to look for, in frames
-    lag_pairs: int  # pairs that are also compared at other lags
-    margin: int  # of a window that is left for lags at each end: one of so many parts
+    offset: int  # largest delay of one camera to look for, in frames
+    offset_pairs: int  # pairs that are also compared at other offsets
+    margin: int  # of a window that is left for offsets at each end: one of so many parts
     whole: bool  # whether a drive is looked at that is longer than what is tracked
 
 
-QUICK: Final = Extent(TRACKED, pairs=6, features=800, lag=3, lag_pairs=2, margin=2, whole=False)
-# In a short window, several pairs with a few lags are better than one pair with all.
-THOROUGH: Final = Extent(300, pairs=12, features=1500, lag=4, lag_pairs=4, margin=3, whole=True)
+QUICK: Final = Extent(
+    TRACKED, pairs=6, features=800, offset=3, offset_pairs=2, margin=2, whole=False
+)
+# In a short window, several pairs with a few offsets are better than one pair with all.
+THOROUGH: Final = Extent(
+    300, pairs=12, features=1500, offset=4, offset_pairs=4, margin=3, whole=True
+)
 
 
 class Window(NamedTuple):
@@ -85,14 +89,14 @@ def _between(parts: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def _centres(start: int, stop: int, many: int, extent: Extent) -> tuple[int, ...]:
-    """Return frames, evenly spread, with a margin for the lags."""
-    margin = min(extent.lag, (stop - start - 1) // extent.margin)
+    """Return frames, evenly spread, with a margin for the offsets."""
+    margin = min(extent.offset, (stop - start - 1) // extent.margin)
     places = np.rint(np.linspace(start + margin, stop - 1 - margin, many)).astype(int)
     return tuple(np.unique(places).tolist())
 
 
-class Lagged(NamedTuple):
-    """A pair at a lag: its matched features, their flow, how many agree on one rotation."""
+class Shifted(NamedTuple):
+    """A pair at an offset: its matched features, their flow, how many agree on one rotation."""
 
     features: PairFeatures
     flow: Float64
@@ -115,7 +119,7 @@ class PairMeasures:
     )  # (N,), rows by which each moves to the next frame; NaN = unknown
     speed_m_per_s: float = np.nan  # of the rig; NaN if unknown
     # by how many frames after the left image the right image is taken from
-    lagged: Mapping[int, Lagged] = field(default_factory=dict)
+    by_offset: Mapping[int, Shifted] = field(default_factory=dict)
 
     @property
     def rows_px(self) -> Float64:
@@ -155,10 +159,13 @@ class Sample:
         return [(one.features, one.flow) for one in seen]
 
     @property
-    def lagged(self) -> dict[int, list[Lagged]]:
-        """By lag, the pairs that were compared at it."""
-        lags = sorted({lag for one in self.pairs for lag in one.lagged})
-        return {lag: [one.lagged[lag] for one in self.pairs if lag in one.lagged] for lag in lags}
+    def by_offset(self) -> dict[int, list[Shifted]]:
+        """By offset, the pairs that were compared at it."""
+        offsets = sorted({offset for one in self.pairs for offset in one.by_offset})
+        return {
+            offset: [one.by_offset[offset] for one in self.pairs if offset in one.by_offset]
+            for offset in offsets
+        }
 
     @property
     def sharpness(self) -> Float64 | None:
@@ -184,15 +191,15 @@ class Chosen(NamedTuple):
 
     shown: Container[int]  # whose rectified images are kept: the first, middle and last
     kept: Container[int]  # which are kept as recorded
-    lagged: Container[int]  # that are compared at other lags, if need be
+    by_offset: Container[int]  # that are compared at other offsets, if need be
 
 
 def choose(windows: Sequence[Window], extent: Extent) -> Chosen:
     """Choose centres of a look, evenly spread."""
     all_ = [centre for window in windows for centre in window.centres]
     shown = {all_[n] for n in (0, len(all_) // 2, -1)} if all_ else set()
-    kept, lagged = (set(all_[:: max(1, len(all_) // n)]) for n in (_KEPT, extent.lag_pairs))
-    return Chosen(shown, kept, lagged)
+    kept, by_offset = (set(all_[:: max(1, len(all_) // n)]) for n in (_KEPT, extent.offset_pairs))
+    return Chosen(shown, kept, by_offset)
 
 
 class Sampler:
@@ -220,14 +227,14 @@ class Sampler:
         self.sample.repeats.add(recorded.left, recorded.right)
         if not self._waiting:
             return
-        lag = self._effort.lag
-        if number >= self._waiting[0] - lag:
+        offset = self._effort.offset
+        if number >= self._waiting[0] - offset:
             # A pair, or part of a drive, may have its numbers from elsewhere.
             both = view if isinstance(view, RectifiedPair) else self._rectifier.rectify(recorded)
             self._recent[number] = replace(both, index=number)
-        self._recent.pop(number - 2 * lag - 1, None)
+        self._recent.pop(number - 2 * offset - 1, None)
         last = self._window.stop - 1
-        while self._waiting and number >= min(self._waiting[0] + lag, last):
+        while self._waiting and number >= min(self._waiting[0] + offset, last):
             self._measure(self._waiting.pop(0))
 
     def _measure(self, centre: int) -> None:
@@ -250,21 +257,21 @@ class Sampler:
                 flow=flow,
                 speed_m_per_s=speed,
             )
-            if centre in self._chosen.lagged and not in_step(features, flow, pair.camera):
-                seen = replace(seen, lagged=self._lags(centre, features))
+            if centre in self._chosen.by_offset and not in_step(features, flow, pair.camera):
+                seen = replace(seen, by_offset=self._offsets(centre, features))
         self.sample.pairs.append(seen)
 
-    def _lags(self, centre: int, features: PairFeatures) -> dict[int, Lagged]:
-        span = min(self._effort.lag, centre - min(self._recent), max(self._recent) - centre)
-        pair, lags = self._recent[centre], dict[int, Lagged]()
-        for lag in range(-span, span + 1):
+    def _offsets(self, centre: int, features: PairFeatures) -> dict[int, Shifted]:
+        span = min(self._effort.offset, centre - min(self._recent), max(self._recent) - centre)
+        pair, offsets = self._recent[centre], dict[int, Shifted]()
+        for offset in range(-span, span + 1):
             found = features
-            if lag:
-                right = self._recent[centre + lag].right
+            if offset:
+                right = self._recent[centre + offset].right
                 found = match_features(pair.left, right, self._effort.features)
             agreeing = count_aligned(found.left_uv, found.right_uv, pair.camera)
-            lags[lag] = Lagged(found, self._follow(centre, found)[0], agreeing)
-        return lags
+            offsets[offset] = Shifted(found, self._follow(centre, found)[0], agreeing)
+        return offsets
 
     def _motion(self, centre: int, features: PairFeatures) -> tuple[Float64, float]:
         """Return rows by which features move to the next frame, and the speed of the rig."""

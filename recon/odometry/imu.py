@@ -31,14 +31,14 @@ class Gyro:
     record: ImuRecord
     R_camera_imu: Float64  # (3, 3), to the axes of the rectified left camera
     bias: Float64  # (3,), radians per second, in its own axes
-    late_s: float = 0.0  # its stamps are later than those of images of the same moment
+    time_offset_s: float = 0.0  # its stamps are later than those of images of the same moment
 
     def knows(self, from_s: float, to_s: float) -> bool:
         """Return whether it measured all the time between two times of images."""
         first, last = self._samples(from_s, to_s)
         times_s = self.record.timestamps_s[first : last + 1]
-        covered = len(times_s) > 1 and times_s[0] <= from_s + self.late_s
-        covered = covered and times_s[-1] >= to_s + self.late_s
+        covered = len(times_s) > 1 and times_s[0] <= from_s + self.time_offset_s
+        covered = covered and times_s[-1] >= to_s + self.time_offset_s
         return bool(covered and np.diff(times_s).max() <= _MOST_STEPS * self._step_s)
 
     def turned(self, from_s: float, to_s: float) -> tuple[Float64, Float64]:
@@ -49,7 +49,7 @@ class Gyro:
         first, last = self._samples(from_s, to_s)
         times_s = self.record.timestamps_s[first : last + 1] + 0.0
         rates = self.record.gyro[first : last + 1] - self.bias
-        ends = np.array([from_s, to_s]) + self.late_s
+        ends = np.array([from_s, to_s]) + self.time_offset_s
         inside = (times_s > ends[0]) & (times_s < ends[1])
         at_ends = np.stack([np.interp(ends, times_s, rate) for rate in rates.T], axis=1)
         times_s = np.concatenate([ends[:1], times_s[inside], ends[1:]])
@@ -67,13 +67,13 @@ class Gyro:
     def stepped(self, step: Float64) -> Gyro:
         """Return the gyro after a step (7,) of the unknowns."""
         turn = turns_after(step[None, :3])[-1] @ self.R_camera_imu
-        return Gyro(self.record, turn, self.bias + step[3:6], self.late_s + float(step[6]))
+        return Gyro(self.record, turn, self.bias + step[3:6], self.time_offset_s + float(step[6]))
 
     def _samples(self, from_s: float, to_s: float) -> tuple[int, int]:
         """Return the samples before and after, as far as there are any."""
-        times_s, late_s = self.record.timestamps_s, self.late_s
-        first = int(np.searchsorted(times_s, from_s + late_s, side="right")) - 1
-        return max(first, 0), int(np.searchsorted(times_s, to_s + late_s, side="left"))
+        times_s, time_offset_s = self.record.timestamps_s, self.time_offset_s
+        first = int(np.searchsorted(times_s, from_s + time_offset_s, side="right")) - 1
+        return max(first, 0), int(np.searchsorted(times_s, to_s + time_offset_s, side="left"))
 
     @cached_property
     def _step_s(self) -> float:
@@ -198,7 +198,7 @@ def accelerations(gyro: Gyro) -> float:
     """
     if doubt_forces(gyro.record):
         return float("inf")
-    begin_s, end_s = gyro.record.timestamps_s[[0, -1]] - gyro.late_s
+    begin_s, end_s = gyro.record.timestamps_s[[0, -1]] - gyro.time_offset_s
     found = []
     for start_s in np.linspace(begin_s, max(begin_s, end_s - _UP_SPAN_S), _PARTS):
         span_s = min(_UP_SPAN_S, float(end_s - start_s))
@@ -215,7 +215,7 @@ def _integrated(gyro: Gyro, begin_s: float, span_s: float) -> tuple[Float64, Flo
 
     In the axes of the camera at that moment; gravity is among the forces.
     """
-    times_s = gyro.record.timestamps_s - gyro.late_s - begin_s
+    times_s = gyro.record.timestamps_s - gyro.time_offset_s - begin_s
     inside = (times_s > 0) & (times_s < span_s)
     at_s = np.concatenate([[0.0], times_s[inside], [span_s]])
     rates, forces = (

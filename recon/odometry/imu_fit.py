@@ -33,10 +33,10 @@ _MEDIAN: Final = 1.538  # median length of an error in space, in standard deviat
 _NOISE: Final = 2e-3  # rad per square root of a second, to begin with
 _BIAS: Final = 0.1  # rad/s, standard deviation of a bias before anything is seen
 _TURN: Final = float(np.deg2rad(1.0))
-_LATE_S: Final = 5e-3
+_TIME_OFFSET_S: Final = 5e-3
 """Standard deviations of axes and stamps as they are stated, since boards bend and exposures last;
 also those up to which what is found may take their place."""
-_STATED: Final = np.array([_TURN] * 3 + [_BIAS] * 3 + [_LATE_S])
+_STATED: Final = np.array([_TURN] * 3 + [_BIAS] * 3 + [_TIME_OFFSET_S])
 _MIRRORED: Final = "its axes are left-handed"
 _IN_DEGREES: Final = "its rates are in degrees per second"
 _CONTRADICTED: Final = 2.0  # how much better a faulty file explains turns than a right one would
@@ -92,7 +92,7 @@ def fit_imu(
         return _unused(why, known, notes)
     fit = free
     if not faults and T_stated is not None:
-        stated = replace(free.gyro, R_camera_imu=T_stated[:3, :3], late_s=0.0)
+        stated = replace(free.gyro, R_camera_imu=T_stated[:3, :3], time_offset_s=0.0)
         fit = _fitted(stated, turns, stated)
     begins = runs[0].path.timestamps_s[0] == stamps_s[0]
     arm_m = np.zeros(3) if T_stated is None else T_stated[:3, 3]
@@ -163,14 +163,14 @@ class _Fit:
     @property
     def certain(self) -> bool:
         """Whether what was found may take the place of what is stated."""
-        return np.deg2rad(self.sigma_deg) <= _TURN and self.sigma_ms <= 1e3 * _LATE_S
+        return np.deg2rad(self.sigma_deg) <= _TURN and self.sigma_ms <= 1e3 * _TIME_OFFSET_S
 
     def axes_off_deg(self, T_stated: Float64) -> float:
         return float(np.rad2deg(angle_rad(self.gyro.R_camera_imu @ T_stated[:3, :3].T)))
 
     def figures(self, T_stated: Float64 | None) -> dict[str, Any]:
         return {
-            "late_ms": 1e3 * self.gyro.late_s,
+            "time_offset_ms": 1e3 * self.gyro.time_offset_s,
             "late_sigma_ms": self.sigma_ms,
             "axes_off_deg": None if T_stated is None else self.axes_off_deg(T_stated),
             "axes_sigma_deg": self.sigma_deg,
@@ -180,9 +180,9 @@ class _Fit:
 def _faults(fit: _Fit, T_stated: Float64 | None) -> list[str]:
     """Return what contradicts the files, in words."""
     gyro, P, lines = fit.gyro, fit.covariance, list[str]()
-    if abs(gyro.late_s) > MAX_SIGMAS * np.hypot(_LATE_S, np.sqrt(P[6, 6])):
-        order = "later" if gyro.late_s > 0 else "earlier"
-        size = f"{abs(1e3 * gyro.late_s):.0f} ± {1.96 * fit.sigma_ms:.0f} ms"
+    if abs(gyro.time_offset_s) > MAX_SIGMAS * np.hypot(_TIME_OFFSET_S, np.sqrt(P[6, 6])):
+        order = "later" if gyro.time_offset_s > 0 else "earlier"
+        size = f"{abs(1e3 * gyro.time_offset_s):.0f} ± {1.96 * fit.sigma_ms:.0f} ms"
         lines.append(f"its stamps are {size} {order} than those of the images")
     if fit.fault:
         lines.append(fit.fault)
@@ -225,7 +225,7 @@ def _aligned(record: ImuRecord, turns: Sequence[_Turn]) -> Gyro:
     """
     lasting = np.array([turn.to_s - turn.from_s for turn in turns])
     seen = np.stack([log_so3(turn.R) for turn in turns]) / lasting[:, None]
-    measured = np.stack([_at_lags(record, turn) for turn in turns]) / lasting[:, None, None]
+    measured = np.stack([_at_offsets(record, turn) for turn in turns]) / lasting[:, None, None]
     sigma = np.hypot([turn.sigma for turn in turns], _NOISE * np.sqrt(lasting)) / lasting
     weight = 1.0 / (sigma**2 + (0.1 * _BIAS) ** 2)
     weight /= weight.sum()
@@ -240,7 +240,7 @@ def _aligned(record: ImuRecord, turns: Sequence[_Turn]) -> Gyro:
     return Gyro(record, R, means[best] - R.T @ mean_seen, float(_LAGS_S[best]))
 
 
-def _at_lags(record: ImuRecord, turn: _Turn) -> Float64:
+def _at_offsets(record: ImuRecord, turn: _Turn) -> Float64:
     """Return the rotation vectors (L, 3) that a gyro measured at all delays, in its own axes."""
     times_s, margin_s = record.timestamps_s, float(_LAGS_S[-1])
     part = slice(
@@ -264,7 +264,11 @@ def _fitted(gyro: Gyro, turns: Sequence[_Turn], stated: Gyro | None = None) -> _
         H, g = information.copy(), np.zeros(7)
         if stated is not None:
             g = information @ np.concatenate(
-                [log_so3(stated.R_camera_imu @ gyro.R_camera_imu.T), -gyro.bias, [-gyro.late_s]]
+                [
+                    log_so3(stated.R_camera_imu @ gyro.R_camera_imu.T),
+                    -gyro.bias,
+                    [-gyro.time_offset_s],
+                ]
             )
         left = []
         for turn in turns:

@@ -171,8 +171,8 @@ def _frames(summary: Mapping[str, Any]) -> str:
 
 
 def _time(summary: Mapping[str, Any]) -> str:
-    if summary["lag_frames"]:
-        return f"right camera {counted(summary['lag_frames'], 'frame', form='+d')} late"
+    if summary["time_offset_frames"]:
+        return f"right camera {counted(summary['time_offset_frames'], 'frame', form='+d')} late"
     if (skew := summary["time_skew_frames"]) is None:
         return "not known"
     return f"right camera {round(skew, 2) + 0.0:+.2f} frames late"  # not a negative zero

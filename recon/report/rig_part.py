@@ -62,7 +62,7 @@ def field_figure(change: RigChange, size_px: tuple[int, int]) -> bytes:
 
 def _off_rows(found: Json) -> list[tuple[str, str, str]]:
     """Return what was wrong with what the rig given saw: figure, value, standard deviation."""
-    off, time = found["disparity_px"], found["right_late"]
+    off, time = found["disparity_px"], found["right_time_offset"]
     late = (
         []
         if time["sigma"] is None

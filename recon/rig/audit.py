@@ -158,7 +158,7 @@ def _figures(look: Look) -> dict[str, Any]:
         "sharpness_right": sharpness[1],
         "features": len(geometry.features),
         "swapped_share": plain(geometry.swapped_share),
-        "lag_frames": geometry.lag,
+        "time_offset_frames": geometry.offset,
         "time_skew_frames": None if look.skew is None else look.skew[0],
         "baseline_m": camera.baseline_m,
         "focal_px": camera.focal_px,

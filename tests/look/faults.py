@@ -85,7 +85,7 @@ def warped(image: np.ndarray, H: np.ndarray, size: tuple[int, int]) -> np.ndarra
     return np.asarray(cv2.warpPerspective(image, H, size))
 
 
-def lag(source: StereoSource, frames: int) -> Spoiled:
+def offset(source: StereoSource, frames: int) -> Spoiled:
     def take(index: int) -> StereoPair:
         return replace(at(source, index + frames), right=at(source, index).right)
 
@@ -143,7 +143,7 @@ CHANGES: dict[str, tuple[str, Change]] = {
 blurred = partial(cv2.GaussianBlur, ksize=(0, 0), sigmaX=2.0)
 FAULTS: dict[str, tuple[str, Callable[[StereoSource], Spoiled]]] = {
     **{name: (code, partial(changed, change=change)) for name, (code, change) in CHANGES.items()},
-    "lag of three frames": ("lag", lambda s: lag(s, 3)),
+    "lag of three frames": ("lag", lambda s: offset(s, 3)),
     "roll of 1 degree": ("rows", lambda s: turned(s, roll_deg=1.0)),
     "duplicated frames": ("duplicates", duplicated),
     "baseline times ten": ("baseline", tenfold_baseline),

@@ -188,7 +188,7 @@ def test_rows_meet_with_the_lenses_that_are_found_and_nothing_is_invented_by_noi
     assert found.windows == WINDOWS
     assert 1.0 <= found.scatter < 2.0
     drives = [fitted(NONE, 100 * n) for n in range(3)]
-    assert all(abs(drive.late) < 0.01 for drive in drives)
+    assert all(abs(drive.time_offset) < 0.01 for drive in drives)
     assert max(rms(off_px(NONE, drive.values)).max() for drive in drives) < 0.05
     assert all((np.linalg.eigvalsh(drive.covariance) > 0).all() for drive in drives)
 
@@ -209,8 +209,8 @@ def test_what_an_earlier_drive_knew_counts_as_far_as_nothing_contradicts_it():
 @pytest.mark.parametrize(("late", "values"), [(0.2, NONE), (-0.4, TURN)], ids=["alone", "turned"])
 def test_late_right_images_are_told_apart_from_a_turned_camera(late: float, values: np.ndarray):
     found = fit_fault([tracks(values, k, late) for k in range(WINDOWS)], FAULT, ALL)
-    assert found.late == pytest.approx(late, abs=0.1 * abs(late))
-    assert found.late_sigma < 0.02
+    assert found.time_offset == pytest.approx(late, abs=0.1 * abs(late))
+    assert found.time_offset_sigma < 0.02
     assert rms(off_px(values, found.values)).max() < 0.1
 
 

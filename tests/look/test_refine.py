@@ -91,7 +91,7 @@ def test_a_turned_right_camera_is_recovered_and_said(street, yaw_deg, enlarged):
         again = refine_rig(later, CONFIG, AUTO, known)
         assert again.applied(later).calibration is rig.calibration
         anew = {"frames": None, "sigma": None, "seconds": None}
-        begun = {"begun_with": "session 0 (film)", "right_late": anew}
+        begun = {"begun_with": "session 0 (film)", "right_time_offset": anew}
         assert again.figures() == {**figures, **begun}
         assert "session 0 (film) showed" in again.warnings()[0]
     assert not refine_rig(source, CONFIG, RigSettings(refine=False), known).refined
@@ -131,7 +131,7 @@ def test_cameras_that_are_not_in_step_do_not_look_turned():
     rig = refine_rig(
         Film(late, slow.calibration, slow.trajectory.T_world_camera[::2]), CONFIG, AUTO
     )
-    assert rig.fitted.late == pytest.approx(0.5, rel=0.2)
+    assert rig.fitted.time_offset == pytest.approx(0.5, rel=0.2)
     # Without the time the yaw would be -0.3°, and disparities 7.6 px off.
     assert abs(rig.figures()["yaw_deg"]) < 0.1
     assert off(slow.calibration, rig.calibration).rms_px < 0.8

@@ -82,8 +82,8 @@ def test_bias_and_up_are_found_and_a_wrong_delay_or_axes_too_and_said(record, fa
     matrix = {"cycled axes": CYCLE, "swapped axes": -SWAP}.get(fault, np.eye(3))
     # Turns of 0.04° at 149 motions of 0.1 s leave 0.04° / s / √149.
     np.testing.assert_allclose(guide.gyro.bias, matrix @ BIAS, atol=5e-4)
-    late_s = {"late": 0.05, "early": -0.05}.get(fault, 0.0)
-    assert guide.gyro.late_s == pytest.approx(late_s, abs=2e-3)
+    time_offset_s = {"late": 0.05, "early": -0.05}.get(fault, 0.0)
+    assert guide.gyro.time_offset_s == pytest.approx(time_offset_s, abs=2e-3)
     assert np.degrees(np.arccos(guide.up @ UP)) < 0.5
     # A sway of 0.5 m at 0.5 rad/s to 0.2 m at 1.3 rad/s: 0.13 to 0.34 m/s² at most.
     assert 0.1 < guide.unsteady < 0.3

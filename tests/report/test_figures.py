@@ -425,7 +425,7 @@ def test_lines_of_an_audit_say_what_is_not_known():
     summary: dict[str, Any] = {
         "frames": 40, "frames_read": 10, "repeated_frames": 2, "frozen_left_frames": 0,
         "frozen_right_frames": 3, "usual_step_s": 0.1, "gaps": 1, "swapped_share": 0.25,
-        "lag_frames": 0, "time_skew_frames": -0.001, "gain": 1.5, "sharpness_left": 0.5,
+        "time_offset_frames": 0, "time_skew_frames": -0.001, "gain": 1.5, "sharpness_left": 0.5,
         "sharpness_right": None, "speed_m_per_s": 9.5, "focal_px": 700.0, "baseline_m": 0.5372,
         "field_of_view_deg": 80.0, "depth_error_m": {"10": 0.0312, "30": 0.0042, "90": 3.0},
         "disparity_5_50_95_px": [1.0, 5.0, 20.0],

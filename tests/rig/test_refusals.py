@@ -56,7 +56,7 @@ def loose(street: faults.Spoiled, sizes_px: tuple[int, ...] = (-9, 0, 6, 12)) ->
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        (lambda s: faults.lag(s, 2), "right camera is 2 frames late"),
+        (lambda s: faults.offset(s, 2), "right camera is 2 frames late"),
         (lambda s: faults.changed(s, lambda left, right: (right, left)), "swapped"),
         (faults.silently_wrong_size, "of another size"),
         (loose, "move against each other"),
@@ -73,7 +73,7 @@ def test_a_recording_that_does_not_show_the_rig_corrects_none(street, tmp_path, 
 @pytest.fixture
 def late(street, tmp_path):
     """A folder with a drive whose right images are two frames late."""
-    pairs = list(faults.lag(street, 2).frames())
+    pairs = list(faults.offset(street, 2).frames())
     grey = [replace(p, left=p.left[:, :, 0], right=p.right[:, :, 0]) for p in pairs]
     return drives.write_kitti(grey, faults.rectified(street), tmp_path)
 
@@ -99,7 +99,7 @@ def test_a_late_drive_is_paired_as_it_belongs_together_and_says_so_first(late, t
 
 def test_a_late_drive_that_cannot_be_paired_otherwise_is_refused(street, tmp_path):
     with pytest.raises(SourceError, match=r"of different moments.*right camera is 2 frames late"):
-        run_map(faults.lag(street, 2), CONFIG, MapOptions(out=tmp_path / "out"))
+        run_map(faults.offset(street, 2), CONFIG, MapOptions(out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 

@@ -159,10 +159,10 @@ def test_what_needs_both_cameras_is_refused(drive, needs_both):
 
 def test_depth_farther_in_time_than_its_own_tolerance_is_that_of_no_image(copied):
     text = (copied / "depth.txt").read_text()
-    for late_s, fits in ((0.019, True), (0.03, False)):
+    for time_offset_s, fits in ((0.019, True), (0.03, False)):
         (copied / "depth.txt").write_text(
             "\n".join(
-                f"{float(line.split()[0]) - LATE_S + late_s:.6f} {line.split()[1]}"
+                f"{float(line.split()[0]) - LATE_S + time_offset_s:.6f} {line.split()[1]}"
                 for line in text.splitlines()[1:]
             )
         )

@@ -52,20 +52,22 @@ def clock_error(
             return 0.0, 0.0
         tried_s = np.arange(low_s, high_s, _STEP_S)
 
-    def during(late_s: float) -> Bool:
-        return np.asarray((times_s - late_s >= first_s) & (times_s - late_s <= last_s))
+    def during(time_offset_s: float) -> Bool:
+        return np.asarray(
+            (times_s - time_offset_s >= first_s) & (times_s - time_offset_s <= last_s)
+        )
 
-    most = max(int(during(late_s).sum()) for late_s in tried_s) if len(tried_s) else 0
+    most = max(int(during(time_offset_s).sum()) for time_offset_s in tried_s) if len(tried_s) else 0
 
-    def misfit(late_s: float) -> float:
-        inner = during(late_s)
+    def misfit(time_offset_s: float) -> float:
+        inner = during(time_offset_s)
         if inner.sum() < max(_FEWEST, most // 2):
             return np.inf
-        return _kept_misfit(ours_at(times_s[inner] - late_s), there_m[inner])[0]
+        return _kept_misfit(ours_at(times_s[inner] - time_offset_s), there_m[inner])[0]
 
     if most < _FEWEST:
         return 0.0, 0.0
-    misfits_m = np.array([misfit(late_s) for late_s in tried_s])
+    misfits_m = np.array([misfit(time_offset_s) for time_offset_s in tried_s])
     best_s = float(tried_s[np.argmin(misfits_m)])
     if best_s in (tried_s[0], tried_s[-1]):
         return 0.0, 0.0
@@ -73,12 +75,12 @@ def clock_error(
     found = minimize_scalar(
         lambda more_s: misfit(best_s + more_s), bounds=(-_STEP_S, _STEP_S), method="bounded"
     )
-    late_s = best_s + float(found.x)
-    inner = during(late_s)
-    sigma_s = _sigma(times_s[inner] - late_s, there_m[inner], ours_at)
+    time_offset_s = best_s + float(found.x)
+    inner = during(time_offset_s)
+    sigma_s = _sigma(times_s[inner] - time_offset_s, there_m[inner], ours_at)
     others_m = misfits_m[np.abs(tried_s - best_s) > 2 * _STEP_S] if apart else [misfit(0.0)]
-    sure = abs(late_s) > SIGMAS * sigma_s and found.fun < _LEAST_GAIN * np.min(others_m)
-    return (late_s, sigma_s) if sure else (0.0, 0.0)
+    sure = abs(time_offset_s) > SIGMAS * sigma_s and found.fun < _LEAST_GAIN * np.min(others_m)
+    return (time_offset_s, sigma_s) if sure else (0.0, 0.0)
 
 
 def _kept_misfit(ours_m: Float64, there_m: Float64) -> tuple[float, Bool]:

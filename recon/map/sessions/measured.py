@@ -136,8 +136,8 @@ class Measured:
     # float64 (N,), standard deviation of a coordinate by the file; None = it does not say
     stated_m: Float64 | None = None
     swapped_m: Float64 | None = None  # (N, 3), with easting and northing swapped
-    late_s: float = 0.0  # by how much their clock was late; times are those of the images
-    late_sigma_s: float = 0.0
+    time_offset_s: float = 0.0  # by how much their clock was late; times are those of the images
+    time_offset_sigma_s: float = 0.0
     degrees: bool = False  # whether the file has latitude and longitude
     turn: Float64 | None = None  # of `fixed_turn`
 
@@ -204,9 +204,9 @@ class Measured:
     def warnings(self) -> list[str]:
         """Return lines of positions that are left out, and of columns that seem swapped."""
         late = []
-        if self.late_s:
-            by = f"{abs(self.late_s):.2f} s {'late' if self.late_s > 0 else 'early'}"
-            kept = f"(± {self.late_sigma_s:.2g} s), and taken as that"
+        if self.time_offset_s:
+            by = f"{abs(self.time_offset_s):.2f} s {'late' if self.time_offset_s > 0 else 'early'}"
+            kept = f"(± {self.time_offset_sigma_s:.2g} s), and taken as that"
             late = [f"the clock of the positions is {by} beside that of the images {kept}"]
         return [*late, *self._left_out(), *self._swapped()]
 
@@ -256,8 +256,8 @@ def measure_along(session: Session, survey: Survey) -> Measured:
     def ours_at(times_s: Float64) -> Float64:
         return _placed(T_map_world @ interpolate_poses(path, times_s), antenna_m)
 
-    late_s, late_sigma_s = clock_error(path, rows, ours_at)
-    rows = rows - np.array([late_s, *[0.0] * 6])
+    time_offset_s, time_offset_sigma_s = clock_error(path, rows, ours_at)
+    rows = rows - np.array([time_offset_s, *[0.0] * 6])
     during = _during(path, rows[:, 0])
     here = rows[during]
     if not len(here):
@@ -274,7 +274,7 @@ def measure_along(session: Session, survey: Survey) -> Measured:
     stated_m = None if np.isnan(sigma_m).any() else sigma_m
     measured = Measured(
         *(here[:, 0], position_m, ours_m, agree, stated_m, survey.swapped_m[during]),
-        *(late_s, late_sigma_s, survey.found.degrees),
+        *(time_offset_s, time_offset_sigma_s, survey.found.degrees),
     )
     places_m = apply(measured.T_survey_map, ours_m[agree]), position_m[agree]
     turn = fixed_turn(*places_m, measured.turn_sigma_m, survey.positions, "positions")
