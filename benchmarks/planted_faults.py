@@ -29,8 +29,8 @@ from recon.look.rig import DEPTHS_M, RefinedRig, RigChange, compare_rigs
 from recon.odometry.registry import make_odometry
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
+from recon.stereo.rectify.epipolar import as_raw
 from recon.stereo.rectify.rectifier import turns_of
-from recon.stereo.rectify.row_alignment import as_raw
 
 SHIFT_PX: Final = 2.0
 MOST_TIMES: Final = 4

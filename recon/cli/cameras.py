@@ -162,7 +162,7 @@ def rectify(
 ) -> None:
     """Rectify a pair or two folders of images, with or without a calibration.
 
-    Writes the rectified images, the remaining row error, and pictures with
+    Writes the rectified images, the remaining epipolar error, and pictures with
     epipolar lines.
 
     Examples:
@@ -204,7 +204,7 @@ def audit(
     repeated frames, exposure, focus and baseline, and predicts the depth error.
     The motion of the drive shows how the rig differs from its calibration, but
     not the scale; recon map uses that rig by itself.
-    With --out, sample pairs, row errors and disparities are drawn in a report.
+    With --out, sample pairs, epipolar errors and disparities are drawn in a report.
 
     Examples:
       recon audit drive.bag --calib camchain.yaml

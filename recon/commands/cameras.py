@@ -36,7 +36,7 @@ from recon.rig.capture import (
 )
 from recon.rig.rectification import (
     RectifyRun,
-    measure_rows,
+    measure_epipolar,
     plan_by_calibration,
     plan_by_features,
     read_pairs,
@@ -121,7 +121,7 @@ def _videos(left: str, right: str | None) -> list[Path]:
     return videos
 
 
-_WARN_ROW_PX: Final = 0.5
+_WARN_EPIPOLAR_PX: Final = 0.5
 _KEPT_TYPES: Final = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 
 
@@ -138,7 +138,7 @@ def run_rectify(
     """Rectify a pair, or all pairs of two folders: what `recon rectify` does.
 
     A calibration file says how, or else the features of some of the pairs. All images are warped;
-    then the row errors of the first pair are measured, and drawn with its epipolar lines.
+    then the epipolar errors of the first pair are measured, and drawn with its epipolar lines.
 
     ``left`` and ``right`` are images, folders or patterns; ``metres_per_unit`` is the unit of the
     translation in an OpenCV file.
@@ -159,7 +159,7 @@ def run_rectify(
                 write_image(run.path(f"right/{_rectified_name(right_file)}"), right_image)
         plan.write(run.content)
         first = read_pair(*images.pairs[0])
-        result = measure_rows(plan, first)
+        result = measure_epipolar(plan, first)
         summary = result.summary
         summary["pairs"] = len(images.pairs)
         summary["frames_left_out"] = len(images.lonely)
@@ -183,9 +183,9 @@ def _warnings(summary: dict[str, Any], images: ImagePairs) -> list[str]:
         lines.append("without a calibration: rows correspond, but depth is up to scale, no metres")
     if summary.get("model") == "raw":
         lines.append("rows correspond as recorded: the images are written unchanged")
-    if summary.get("row_error_px", 0.0) > _WARN_ROW_PX:
-        lines.append(f"rows are {summary['row_error_px']:.2f} px apart: a matcher needs 0.5")
-    if "row_error_px" not in summary:
+    if summary.get("epipolar_error_px", 0.0) > _WARN_EPIPOLAR_PX:
+        lines.append(f"rows are {summary['epipolar_error_px']:.2f} px apart: a matcher needs 0.5")
+    if "epipolar_error_px" not in summary:
         lines.append("no features to measure rows by")
     if images.lonely:
         names = ", ".join(path.name for path in images.lonely[:6])

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Bool, Float64
+from recon.stereo.rectify.epipolar import as_raw, correct_rig
 from recon.stereo.rectify.lens import rays_of
 from recon.stereo.rectify.rectifier import RectifyingTurns
-from recon.stereo.rectify.row_alignment import as_raw, correct_rig
 
 LENS: Final = ("k1", "k2", "k3", "p1", "p2", "s1", "s2", "s3", "s4")
 _IN_OPENCV: Final = [0, 1, 4, 2, 3, 8, 9, 10, 11]  # k1 k2 p1 p2 k3 … k6 s1 … s4

@@ -25,8 +25,10 @@ Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for t
 _FATAL: Final = {"unreadable", "black", "frozen", "swapped", "lag", "nonrigid", "size", "baseline"}
 _SIDES = ("left", "right")
 _SWAPPED_SHARE: Final = 0.8  # share of negative disparities from which the cameras count as swapped
-_ROW_PX: Final = 0.75  # rms row error above which it is reported
-_BAD_ROW_PX: Final = 1.5  # rms row error above which it is fatal, unless recon map corrects it
+_EPIPOLAR_PX: Final = 0.75  # rms epipolar error above which it is reported
+_BAD_EPIPOLAR_PX: Final = (
+    1.5  # rms epipolar error above which it is fatal, unless recon map corrects it
+)
 _GAIN: Final = 1.2  # brightness ratio above which a finding is reported
 _SHARPNESS_RATIO: Final = 0.65  # one camera counts as blurred below, relative to the other
 _SHARPNESS: Final = 0.14  # both cameras count as blurred below this sharpness
@@ -62,7 +64,7 @@ _TEXTS: Final = {
     "stabilised": "{found}",
     "features": "too few features match between left and right ({matched} matched) to check the "
     "geometry: the images show too little texture, or different scenes",
-    "rows": "rows of left and right are not aligned: {rows.rms_px:.2f} px rms, mean "
+    "rows": "left and right rows are not aligned: {rows.rms_px:.2f} px rms, mean "
     "{rows.mean_px:+.2f} px, spread {rows.spread_px:.2f} px; rotating the right camera by "
     "{pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: {who}recon audit --mend FILE "
     "writes it",
@@ -181,10 +183,10 @@ def _of_geometry(look: Look) -> Found:
         yield "nonrigid", {"found": look.rig.not_rigid[0]}
     elif rows is None and geometry.pairs:
         yield "features", {"matched": geometry.matched}
-    elif rows is not None and rows.rms_px > _ROW_PX:
+    elif rows is not None and rows.rms_px > _EPIPOLAR_PX:
         pitch, _, roll, _ = np.degrees(rows.turn)
         corrected = look.rig.fitted is not None
-        fatal = rows.rms_px > _BAD_ROW_PX and not corrected
+        fatal = rows.rms_px > _BAD_EPIPOLAR_PX and not corrected
         who = "recon map does so, and " if corrected else ""
         yield "rows", {"fatal": fatal, "rows": rows, "pitch": pitch, "roll": roll, "who": who}
 

@@ -12,13 +12,13 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
 from recon.look.measures import LARGEST_SKEW, MIN_FEATURES, align_features, time_skew
 from recon.look.sample import Sample, Shifted
+from recon.stereo.rectify.epipolar import EpipolarAlignment, align_epipolar
 from recon.stereo.rectify.features import PairFeatures, inspect_features, pool_features
-from recon.stereo.rectify.row_alignment import RowAlignment, align_rows
 
 _ByOffset = Mapping[int, Sequence[Shifted]]
 _OFFSET_FACTOR: Final = 1.25  # agreement relative to offset 0 from which a delay is reported
 _ALIKE: Final = 1.5  # agreement of the best offset relative to another that fits about as well
-MOST_ROWS_PX: Final = 1.5
+MOST_EPIPOLAR_ERROR_PX: Final = 1.5
 """Epipolar error from which a pair is not matched rightly. As far as cameras turn against each
 other up and down, they turn to the side, which shifts every disparity and is seen nowhere."""
 _LEAST_PAIRS: Final = 3  # of which half would have to be wrong for the spread to be
@@ -32,7 +32,7 @@ class Geometry:
     pairs: int  # whose features were matched
     features: PairFeatures  # of all pairs; if one camera is delayed, of pairs shifted by the offset
     matched: int  # number of features matched in pairs as recorded
-    alignment: RowAlignment | None  # row errors; None if there are too few features
+    alignment: EpipolarAlignment | None  # epipolar errors; None if there are too few features
     disparity_px: Float64  # (M,), of the features whose rows agree; 0 is at infinity
     swapped_share: float  # of near features, farther right in the right image; NaN = too few
     out_of_step: bool  # whether images of other moments fit better
@@ -66,7 +66,7 @@ def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
 
 
 def _disparities(
-    features: PairFeatures, alignment: RowAlignment | None, camera: RectifiedCamera
+    features: PairFeatures, alignment: EpipolarAlignment | None, camera: RectifiedCamera
 ) -> Float64:
     if alignment is None:
         return np.zeros(0)
@@ -125,7 +125,7 @@ class Rigidity:
     """Epipolar errors, right minus left row, of some pairs of a drive."""
 
     frames: tuple[int, ...]
-    rows_px: Float64  # (N,), mean of the features of each pair
+    epipolar_error_px: Float64  # (N,), mean of the features of each pair
     # (N,), median of what is left when the rotation that all pairs show is taken away: with a roll
     # alone, rows depend on where features are
     apart_px: Float64
@@ -139,11 +139,11 @@ class Rigidity:
 
     @property
     def kept(self) -> bool:
-        return self.spread_px <= MOST_ROWS_PX
+        return self.spread_px <= MOST_EPIPOLAR_ERROR_PX
 
     def describe(self) -> str:
         """Return in words how the cameras moved; of pairs that are not rigid."""
-        rows = zip(self.frames, self.rows_px, strict=True)
+        rows = zip(self.frames, self.epipolar_error_px, strict=True)
         found = ", ".join(f"{row:+.0f} px in frame {frame}" for frame, row in rows)
         return (
             "the cameras move against each other, or their images are of different moments: the "
@@ -153,7 +153,7 @@ class Rigidity:
 
 
 def measure_rigidity(
-    sample: Sample, camera: RectifiedCamera, common: RowAlignment | None
+    sample: Sample, camera: RectifiedCamera, common: EpipolarAlignment | None
 ) -> Rigidity:
     """Measure the epipolar error of each pair of which most features agree on one.
 
@@ -162,12 +162,12 @@ def measure_rigidity(
     found: dict[int, tuple[float, float]] = {}
     for one in sample.pairs:
         seen = one.features
-        aligned = align_rows(seen.left_uv, seen.right_uv, camera)
+        aligned = align_epipolar(seen.left_uv, seen.right_uv, camera)
         if aligned is not None and 2 * aligned.agreeing > len(seen):
             right = (
                 seen.right_uv[:, 1] if common is None else common.turned_rows(seen.right_uv, camera)
             )
             left_px = float(np.median(right - seen.left_uv[:, 1]))
             found[one.index] = (aligned.mean_px, left_px)
-    rows_px, apart_px = np.array([*found.values()]).reshape(-1, 2).T
-    return Rigidity(tuple(found), rows_px, apart_px)
+    epipolar_error_px, apart_px = np.array([*found.values()]).reshape(-1, 2).T
+    return Rigidity(tuple(found), epipolar_error_px, apart_px)

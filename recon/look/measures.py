@@ -14,8 +14,8 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.odometry.pose import find_consensus, fit_pose
 from recon.sources.source import StereoSource
+from recon.stereo.rectify.epipolar import EpipolarAlignment, align_epipolar
 from recon.stereo.rectify.features import PairFeatures
-from recon.stereo.rectify.row_alignment import RowAlignment, align_rows
 
 _AROUND_PX: Final = 9  # half of these may be saturated before their median is
 _DARK: Final = 12.0
@@ -134,16 +134,18 @@ def measure_speed(
     return float(np.linalg.norm(T[:3, 3]))
 
 
-def measure_time_skew(row_error_px: Float64, row_flow_px: Float64) -> tuple[float, float] | None:
+def measure_time_skew(
+    epipolar_error_px: Float64, row_flow_px: Float64
+) -> tuple[float, float] | None:
     """Return the delay of the right camera in frames, and its standard error; None if unknown.
 
-    It is the slope of the row error (right minus left, (N,)) over the rows that features move by in
+    It is the slope of the epipolar error (right minus left, (N,)) over the rows that features move by in
     a frame, as a late camera sees them moved on.
     """
     moving = np.abs(row_flow_px) > _MIN_FLOW_PX
     if moving.sum() < _MIN_POINTS:
         return None
-    flow, error = row_flow_px[moving], row_error_px[moving]
+    flow, error = row_flow_px[moving], epipolar_error_px[moving]
     weight = np.ones(len(flow))
     slope = 0.0
     for _ in range(10):
@@ -177,11 +179,11 @@ def find_gaps(source: StereoSource) -> Gaps:
     return Gaps(count, float(steps[after]), after, usual_s)
 
 
-def align_features(features: PairFeatures, camera: RectifiedCamera) -> RowAlignment | None:
+def align_features(features: PairFeatures, camera: RectifiedCamera) -> EpipolarAlignment | None:
     """Fit the rotation that aligns the rows of features; None if too few agree."""
     if len(features) < MIN_FEATURES:
         return None
-    found = align_rows(features.left_uv, features.right_uv, camera)
+    found = align_epipolar(features.left_uv, features.right_uv, camera)
     return found if found is not None and found.agreeing >= MIN_FEATURES else None
 
 
@@ -189,7 +191,7 @@ def time_skew(
     pairs: Sequence[PairFeatures],
     flows: Sequence[Float64],
     camera: RectifiedCamera,
-    alignment: RowAlignment | None,
+    alignment: EpipolarAlignment | None,
 ) -> tuple[float, float] | None:
     """Return the skew in frames with its standard error, from features of pairs and their flow."""
     if alignment is None:
@@ -197,7 +199,7 @@ def time_skew(
     errors, moving = [np.zeros(0)], [np.zeros(0)]
     for features, flow in zip(pairs, flows, strict=True):
         rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
-        # The skew is at most half a frame, so a larger row error means a wrong match.
+        # The skew is at most half a frame, so a larger epipolar error means a wrong match.
         known = np.isfinite(flow) & (np.abs(rows) < 1.5 + 0.5 * np.abs(flow))
         errors.append(rows[known])
         moving.append(flow[known])

@@ -29,16 +29,16 @@ from recon.look.tracks import FRAMES, StereoTracks
 from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource
 from recon.stereo.frame import StereoSettings
+from recon.stereo.rectify.epipolar import EpipolarAlignment, as_raw, correct_rig
 from recon.stereo.rectify.lens import project_raw
 from recon.stereo.rectify.rectifier import (
     RectificationSettings,
     turns_of,
 )
-from recon.stereo.rectify.row_alignment import RowAlignment, as_raw, correct_rig
 
 MIN_WINDOWS: Final = 6  # fewer windows do not show how much they contradict each other
 DEPTHS_M: Final = (10.0, 30.0)  # distances for which the depth error is stated
-_MATCHED_ROWS_PX: Final = 0.3  # rms row error that does not spoil matching
+_MATCHED_ROWS_PX: Final = 0.3  # rms epipolar error that does not spoil matching
 _PASSES: Final = 2  # a rig that was far off is matched, and fitted, once more
 _FAR_OFF_PX: Final = 1.0  # what features moved by, root mean square, if it was
 _FEATURES: Final = 800  # per image, to align rows by
@@ -62,7 +62,7 @@ class RigChange:
 
     depth_m: float  # of what is seen
     off_px: Float64  # (rows, columns), disparity as given minus as refined; NaN = not in both views
-    rows_px: Float64  # the same of the rows of right minus left
+    epipolar_error_px: Float64  # the same of the rows of right minus left
 
     @property
     def mean_px(self) -> float:
@@ -73,13 +73,13 @@ class RigChange:
         return float(np.sqrt(np.nanmean(self.off_px**2)))
 
     @property
-    def rows_rms_px(self) -> float:
-        return float(np.sqrt(np.nanmean(self.rows_px**2)))
+    def epipolar_rms_px(self) -> float:
+        return float(np.sqrt(np.nanmean(self.epipolar_error_px**2)))
 
     @property
     def moved_px(self) -> float:
         """By how far features of the right image move against the left one, root mean square."""
-        return float(np.hypot(self.rms_px, self.rows_rms_px))
+        return float(np.hypot(self.rms_px, self.epipolar_rms_px))
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +217,7 @@ class RefinedRig:
                 "sigma": self.sigma_px,
                 "rms": self.changes[-1].rms_px,
             },
-            "rows_px": self.changes[-1].rows_rms_px,
+            "epipolar_error_px": self.changes[-1].epipolar_rms_px,
             "right_time_offset": {
                 "frames": self.fitted.time_offset,
                 "sigma": self.fitted.time_offset_sigma,
@@ -380,12 +380,12 @@ def compare_rigs(
     scale = (camera.focal_px * camera.baseline_m) / (camera_now.focal_px * camera_now.baseline_m)
     seen_px = scale * (left[:, 0] - right[:, 0] + camera_now.doffs_px)
     fields = (disparity_px - seen_px, left[:, 1] - right[:, 1])
-    off_px, rows_px = (field.reshape(_FIELD[::-1]) for field in fields)
-    return RigChange(depth_m, off_px, rows_px)
+    off_px, epipolar_error_px = (field.reshape(_FIELD[::-1]) for field in fields)
+    return RigChange(depth_m, off_px, epipolar_error_px)
 
 
 def turned_to_meet(
-    rig: Rig, alignment: RowAlignment | None, settings: RectificationSettings
+    rig: Rig, alignment: EpipolarAlignment | None, settings: RectificationSettings
 ) -> tuple[Rig, Float64]:
     """Return a rig whose rows meet well enough to be matched, and what turned its right camera."""
     if alignment is None or alignment.rms_px <= _MATCHED_ROWS_PX:

@@ -22,9 +22,9 @@ from recon.look.measures import (
     track,
 )
 from recon.look.tracks import REACH, TRACKED, tracked_parts
+from recon.stereo.rectify.epipolar import count_aligned
 from recon.stereo.rectify.features import NO_FEATURES, PairFeatures, match_features
 from recon.stereo.rectify.rectifier import Rectifier
-from recon.stereo.rectify.row_alignment import count_aligned
 
 Sides = tuple[float, float]  # of the left and of the right image
 _KEPT: Final = 6  # pairs that are kept as recorded
@@ -122,7 +122,7 @@ class PairMeasures:
     by_offset: Mapping[int, Shifted] = field(default_factory=dict)
 
     @property
-    def rows_px(self) -> Float64:
+    def epipolar_error_px(self) -> Float64:
         """float64 (N,): row of each feature in the right image minus that in the left one."""
         apart = self.features.right_uv[:, 1] - self.features.left_uv[:, 1]
         return apart.astype(np.float64)

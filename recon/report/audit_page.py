@@ -21,7 +21,7 @@ from recon.run.directory import RunDirectory
 from recon.sources.source import StereoSource
 from recon.stereo.match.protocol import Matcher
 
-_LONGER: Final = 20.0  # row errors are drawn longer than they are, as the caption says
+_LONGER: Final = 20.0  # epipolar errors are drawn longer than they are, as the caption says
 _SHOWN_ROWS_PX: Final = 5.0  # farther apart are wrong matches
 
 
@@ -48,21 +48,21 @@ def _pair(look: PairMeasures, pair: RectifiedPair, matcher: Matcher) -> dict[str
         "index": look.index,
         "wide": is_wide(disparity.values.shape),
         "images": pair_figure(pair),
-        "rows": rows_figure(look, pair) if len(look.features) else None,
+        "rows": epipolar_figure(look, pair) if len(look.features) else None,
         "disparity": disparity_figure(disparity, pair.camera),
         "valid_percent": 100 * disparity.measured.mean(),
     }
 
 
 @style.styled
-def rows_figure(look: PairMeasures, pair: RectifiedPair) -> bytes:
-    """Draw the left image with the row error of each feature."""
+def epipolar_figure(look: PairMeasures, pair: RectifiedPair) -> bytes:
+    """Draw the left image with the epipolar error of each feature."""
     height, width = pair.left.shape
     size_in = style.WIDE_IN if is_wide(pair.left.shape) else style.WIDE_IN / 2
     figure = style.bare_figure(size_in, size_in * height / width)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     style.show_image(axes, pair.left)
-    at, apart = look.features.left_uv, look.rows_px
+    at, apart = look.features.left_uv, look.epipolar_error_px
     near = np.abs(apart) <= _SHOWN_ROWS_PX
     axes.quiver(
         *at[near].T, np.zeros(near.sum()), _LONGER * apart[near], apart[near],
@@ -70,13 +70,13 @@ def rows_figure(look: PairMeasures, pair: RectifiedPair) -> bytes:
         headwidth=2, headlength=2, headaxislength=2,
     )  # fmt: skip
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
-    return style.to_png(figure, f"Row errors: {style.spread(apart, ' px')}")
+    return style.to_png(figure, f"Epipolar errors: {style.spread(apart, ' px')}")
 
 
 @style.styled
 def frames_figure(looks: Sequence[PairMeasures]) -> bytes:
-    """Draw brightness, sharpness and row error of the measured pairs."""
-    labels = ("mean grey level", "sharpness (0 to 1)", "row error (px)\nmedian, middle half")
+    """Draw brightness, sharpness and epipolar error of the measured pairs."""
+    labels = ("mean grey level", "sharpness (0 to 1)", "epipolar error (px)\nmedian, middle half")
     figure, (brightness, sharpness, rows) = style.stacked(6.4, "frame", labels)
     frames = [look.index for look in looks]
     grey, sharp = [look.brightness_dn for look in looks], [look.sharpness for look in looks]
@@ -87,7 +87,9 @@ def frames_figure(looks: Sequence[PairMeasures]) -> bytes:
     sharpness.set_ylim(bottom=0)
     known = [look for look in looks if len(look.features)]
     if known:
-        spread = np.array([np.quantile(look.rows_px, (0.25, 0.5, 0.75)) for look in known])
+        spread = np.array(
+            [np.quantile(look.epipolar_error_px, (0.25, 0.5, 0.75)) for look in known]
+        )
         places = [look.index for look in known]
         reach = np.abs(spread[:, [0, 2]].T - spread[:, 1])
         rows.errorbar(places, spread[:, 1], reach, fmt="o", color=style.ESTIMATE, capsize=3)
@@ -102,8 +104,8 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
     lines = {
         "frames": _frames(summary),
         "rows": known(
-            "{row_error_rms_px:.2f} px rms (mean {row_error_mean_px:+.2f}, "
-            "spread {row_error_spread_px:.2f}, feature noise {row_noise_px:.2f}); "
+            "{epipolar_error_rms_px:.2f} px rms (mean {epipolar_error_mean_px:+.2f}, "
+            "spread {epipolar_error_spread_px:.2f}, feature noise {epipolar_noise_px:.2f}); "
             "corrected by pitch {mend_pitch_deg:+.3f}, roll {mend_roll_deg:+.3f} deg"
         ),
         "left, right": "not known"

@@ -31,7 +31,7 @@ def write_calibration_page(result: CalibrationRun, run: RunDirectory) -> None:
         "coverage": coverage_figure(result),
         "view_errors": errors_figure(result),
         **_epipolar_pictures(result),
-        "row_errors": rows_figure(result),
+        "epipolar_errors": epipolar_figure(result),
         "depth_error": depth_error_figure(result),
     }
     _write_pictures(figures, run)
@@ -95,14 +95,14 @@ def errors_figure(result: CalibrationRun) -> bytes:
 
 
 @style.styled
-def rows_figure(result: CalibrationRun) -> bytes:
+def epipolar_figure(result: CalibrationRun) -> bytes:
     """Draw the row differences of the corners after rectification."""
     figure, axes = style.subplots(style.HALF_IN, 3.4)
-    reach = max(float(np.quantile(np.abs(result.rows_px), 0.999)), 0.05)
-    axes.hist(result.rows_px, bins=list(np.linspace(-reach, reach, 61)))
+    reach = max(float(np.quantile(np.abs(result.epipolar_error_px), 0.999)), 0.05)
+    axes.hist(result.epipolar_error_px, bins=list(np.linspace(-reach, reach, 61)))
     axes.axvline(0, color=style.INK, linewidth=1)
     axes.set(xlabel="row left − row right, px", ylabel="corners")
-    return style.to_png(figure, f"Row differences: {style.spread(result.rows_px, ' px')}")
+    return style.to_png(figure, f"Epipolar errors: {style.spread(result.epipolar_error_px, ' px')}")
 
 
 @style.styled

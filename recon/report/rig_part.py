@@ -78,7 +78,7 @@ def _off_rows(found: Json) -> list[tuple[str, str, str]]:
         ("disparity, mean", f"{off['mean']:+.2f} px", f"{off['sigma']:.2f} px"),
         ("disparity, rms over the image", f"{off['rms']:.2f} px", NOT_KNOWN),
         *depths,
-        ("rows, rms over the image", f"{found['rows_px']:.2f} px", NOT_KNOWN),
+        ("epipolar error, rms over the image", f"{found['epipolar_error_px']:.2f} px", NOT_KNOWN),
         *late,
     ]
 

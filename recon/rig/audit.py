@@ -23,8 +23,8 @@ from recon.rig.written import form_of, nearest_of_kalibr, write_rig
 from recon.sources.one_pair import OnePair, PairInput
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor, StereoSettings
+from recon.stereo.rectify.epipolar import EpipolarAlignment, correct_rig
 from recon.stereo.rectify.rectifier import turns_of
-from recon.stereo.rectify.row_alignment import RowAlignment, correct_rig
 from recon.stereo.support import Support
 
 _RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth error is predicted
@@ -51,7 +51,7 @@ class Audit:
         verdict: good, usable or not usable.
         findings: Problems found, fatal ones first.
         figures: All measures, ready for JSON.
-        alignment: Row errors of all pairs together; None if there are too few features.
+        alignment: Epipolar errors of all pairs together; None if there are too few features.
         rig: The rig as given, and as the motion of the drive shows it.
         pairs: What was measured in each pair, and a few of the images.
         corrected: What `correct_calibration` did, if it was asked to.
@@ -60,7 +60,7 @@ class Audit:
     verdict: Verdict
     findings: tuple[Finding, ...]
     figures: dict[str, Any]
-    alignment: RowAlignment | None
+    alignment: EpipolarAlignment | None
     rig: RefinedRig
     pairs: tuple[PairMeasures, ...] = ()
     corrected: dict[str, Any] | None = None
@@ -119,7 +119,7 @@ def correct_calibration(
             where=source.name,
             hint="record scenes with more texture, or recalibrate the cameras",
         )
-    figures = {"row_error_before_px": rows.rms_px}
+    figures = {"epipolar_error_before_px": rows.rms_px}
     if rig.fitted is None:
         R_left = turns_of(source.calibration, config.rectification).R_left
         corrected: Rig = correct_rig(source.calibration, rows.turn, R_left)
@@ -170,17 +170,17 @@ def _figures(look: Look) -> dict[str, Any]:
 
 
 def _alignment_figures(
-    alignment: RowAlignment | None, disparity_px: Float64, camera: RectifiedCamera
+    alignment: EpipolarAlignment | None, disparity_px: Float64, camera: RectifiedCamera
 ) -> dict[str, Any]:
-    """Return row errors, disparities, and the depth error if columns are as accurate as rows."""
+    """Return epipolar errors, disparities, and the depth error if columns are as accurate as rows."""
     if alignment is None:
         return {}
     pitch_deg, _, roll_deg, _ = np.degrees(alignment.turn).tolist()
     figures = {
-        "row_error_mean_px": alignment.mean_px,
-        "row_error_spread_px": alignment.spread_px,
-        "row_error_rms_px": alignment.rms_px,
-        "row_noise_px": alignment.residual_px,
+        "epipolar_error_mean_px": alignment.mean_px,
+        "epipolar_error_spread_px": alignment.spread_px,
+        "epipolar_error_rms_px": alignment.rms_px,
+        "epipolar_noise_px": alignment.residual_px,
         "mend_pitch_deg": pitch_deg,
         "mend_roll_deg": roll_deg,
     }

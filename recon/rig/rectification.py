@@ -29,7 +29,7 @@ from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier, pla
 # Pairs of a folder whose features are matched where there is no calibration: in other pairs of a
 # flown room rows are 0.44 to 0.52 px apart by 8 of them, 0.41 to 0.43 by 16, and 0.41 by 74.
 _UNCALIBRATED_PAIRS: Final = 16
-# A row error above this multiple of the median is a false match, not a calibration error.
+# A epipolar error above this multiple of the median is a false match, not a calibration error.
 _WRONG: Final = 5.0
 _NEVER_WRONG_PX: Final = 0.5
 Lines = tuple[list[Float64], list[Float64]]
@@ -155,8 +155,8 @@ def read_pairs(images: ImagePairs) -> Iterator[tuple[StereoPair, tuple[Path, Pat
         yield pair, files
 
 
-def measure_rows(plan: RectifyPlan, pair: StereoPair) -> RectifyRun:
-    """Rectify a pair, and measure the row errors that are left by its feature matches."""
+def measure_epipolar(plan: RectifyPlan, pair: StereoPair) -> RectifyRun:
+    """Rectify a pair, and measure the epipolar errors that are left by its feature matches."""
     found = match_exactly(to_grey(pair.left), to_grey(pair.right))
     raw = (found.left_uv.astype(np.float64), found.right_uv.astype(np.float64))
     left, right = plan.place(*raw)
@@ -166,9 +166,9 @@ def measure_rows(plan: RectifyPlan, pair: StereoPair) -> RectifyRun:
     summary = {"pair": pair.name, **plan.figures, "features": int(good.sum())}
     if good.any():
         summary |= {
-            "row_error_px": float(rows[good].mean()),
-            "row_error_median_px": float(np.median(rows[good])),
-            "row_error_95_px": float(np.quantile(rows[good], 0.95)),
+            "epipolar_error_px": float(rows[good].mean()),
+            "epipolar_error_median_px": float(np.median(rows[good])),
+            "epipolar_error_95_px": float(np.quantile(rows[good], 0.95)),
         }
     kept = (raw[0][good], raw[1][good])
     return RectifyRun(

@@ -19,6 +19,7 @@ from recon.core.least_squares import Problem, minimise
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, UInt8
+from recon.stereo.rectify.epipolar import align_epipolar
 from recon.stereo.rectify.features import (
     MOST_FEATURES,
     PairFeatures,
@@ -27,7 +28,6 @@ from recon.stereo.rectify.features import (
     match_exactly,
     pool_features,
 )
-from recon.stereo.rectify.row_alignment import align_rows
 
 Size = tuple[int, int]
 Homographies = tuple[Float64, Float64]
@@ -48,7 +48,9 @@ _MIN_FEATURES: Final = 40  # matches that must agree on one geometry
 _HELD_OUT: Final = 4  # every fourth feature of a single pair is held out of the fit
 _FLAT_SHARE: Final = 0.9  # share of matches on one plane from which the scene counts as flat
 _FOCAL_WIDTHS: Final = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0)  # tried: they decide how pitch bends rows
-_RESOLVED_PX: Final = 0.5  # row error that a simpler model may have more: warped images cost more
+_RESOLVED_PX: Final = (
+    0.5  # epipolar error that a simpler model may have more: warped images cost more
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +60,11 @@ class UncalibratedRectification:
     model: str  # what aligns the rows: "raw" (nothing to do), "rotation" or "homographies"
     matches: int  # number of all matches
     inliers: int  # number of those that the homographies bring onto one row
-    row_error_before_px: float  # median absolute row error of all matches of all pairs, raw
-    row_error_after_px: float  # the same, rectified
-    row_error_held_out_px: float  # mean of matches held out of the fit; NaN = too few
+    epipolar_error_before_px: (
+        float  # median absolute epipolar error of all matches of all pairs, raw
+    )
+    epipolar_error_after_px: float  # the same, rectified
+    epipolar_error_held_out_px: float  # mean of matches held out of the fit; NaN = too few
     disparity_range_px: tuple[float, float]  # 1st and 99th percentile of the rectified disparity
     H_left: Float64  # (3, 3), from raw to rectified pixels
     H_right: Float64  # the same for the right image
@@ -92,7 +96,7 @@ def rectify_images(
 def rectify_features(
     matched: Sequence[PairFeatures], size: Size, min_features: int = _MIN_FEATURES
 ) -> UncalibratedRectification:
-    """Find the simplest change whose held-out row errors are not clearly above the smallest.
+    """Find the simplest change whose held-out epipolar errors are not clearly above the smallest.
 
     Held out are every second pair or, of fewer than four, every fourth feature. ``min_features``
     must agree on homographies.
@@ -103,7 +107,7 @@ def rectify_features(
     block = np.unique(pair, return_inverse=True)[1] if several else np.arange(len(features))
     held = block % 2 == 1 if several else block % _HELD_OUT == 0
     trials, _ = _candidates(features.select(~held), size, _FEWEST_AT_FIRST)
-    held_out = {name: _row_errors(H, features.select(held)) for name, H in trials.items()}
+    held_out = {name: _epipolar_errors(H, features.select(held)) for name, H in trials.items()}
     counts = np.bincount(block[held])
     blocks = {
         name: np.bincount(block[held], errors)[counts > 0] / counts[counts > 0]
@@ -111,9 +115,9 @@ def rectify_features(
     }
     best = min(blocks.values(), key=lambda each: float(each.sum()))
     fits, refusal = _candidates(features, size, min_features)
-    before = _row_errors(fits["raw"], features)
+    before = _epipolar_errors(fits["raw"], features)
     for name, H in fits.items():
-        after = _row_errors(H, features)
+        after = _epipolar_errors(H, features)
         if name not in blocks or _clearly_above(blocks[name], best) or after.sum() > before.sum():
             continue
         # A model that is no homography has to hold for most matches, else there is no geometry.
@@ -122,7 +126,7 @@ def rectify_features(
             return _result(name, H, features, held_out[name])
     raise refusal or CalibrationError(
         "rows cannot be aligned",
-        got=f"{before.mean():.1f} px mean row error as recorded, and no smaller one",
+        got=f"{before.mean():.1f} px mean epipolar error as recorded, and no smaller one",
         hint="use more pairs with texture, or a calibration: recon calibrate",
     )
 
@@ -134,7 +138,7 @@ def _candidates(
     fits = {"raw": (np.eye(3), np.eye(3))}
     turns = [H for share in _FOCAL_WIDTHS if (H := _turned(features, size, share)) is not None]
     if turns:
-        fits["rotation"] = min(turns, key=lambda H: float(_row_errors(H, features).mean()))
+        fits["rotation"] = min(turns, key=lambda H: float(_epipolar_errors(H, features).mean()))
     try:
         fits["homographies"] = _fit(features, size, min_features)
     except CalibrationError as refusal:
@@ -146,7 +150,7 @@ def _turned(features: PairFeatures, size: Size, focal_widths: float) -> Homograp
     """Return the homographies of the smallest rotation of the right camera that aligns rows."""
     cx, cy, focal = (size[0] - 1) / 2, (size[1] - 1) / 2, focal_widths * size[0]
     camera = RectifiedCamera(focal, cx, cy, cx, 1.0, *size)
-    found = align_rows(features.left_uv, features.right_uv, camera)
+    found = align_epipolar(features.left_uv, features.right_uv, camera)
     if found is None:
         return None
     K = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1.0]])
@@ -180,8 +184,8 @@ def _fit(features: PairFeatures, size: Size, min_features: int) -> Homographies:
     return rectifying_homographies(F, some, size)
 
 
-def _row_errors(H: Homographies, features: PairFeatures) -> Float64:
-    """Return float64 (N,), absolute row errors of matches; those of false matches are limited."""
+def _epipolar_errors(H: Homographies, features: PairFeatures) -> Float64:
+    """Return float64 (N,), absolute epipolar errors of matches; those of false matches are limited."""
     left, right = map_pixels(H[0], features.left_uv), map_pixels(H[1], features.right_uv)
     return np.minimum(np.abs(left[:, 1] - right[:, 1]), 4 * _INLIER_PX)
 
@@ -196,7 +200,7 @@ def _clearly_above(errors: Float64, best: Float64) -> bool:
 def _result(
     model: str, H: Homographies, features: PairFeatures, held_out: Float64
 ) -> UncalibratedRectification:
-    errors = _row_errors(H, features)
+    errors = _epipolar_errors(H, features)
     agreeing, good = errors < _INLIER_PX, held_out < 4 * _INLIER_PX
     left, right = map_pixels(H[0], features.left_uv), map_pixels(H[1], features.right_uv)
     low, high = np.percentile((left - right)[agreeing, 0], (1, 99))
@@ -204,9 +208,11 @@ def _result(
         model=model,
         matches=len(features),
         inliers=int(agreeing.sum()),
-        row_error_before_px=float(np.median(np.abs(features.left_uv - features.right_uv)[:, 1])),
-        row_error_after_px=float(np.median(errors)),
-        row_error_held_out_px=float(held_out[good].mean()) if good.any() else float("nan"),
+        epipolar_error_before_px=float(
+            np.median(np.abs(features.left_uv - features.right_uv)[:, 1])
+        ),
+        epipolar_error_after_px=float(np.median(errors)),
+        epipolar_error_held_out_px=float(held_out[good].mean()) if good.any() else float("nan"),
         disparity_range_px=(float(low), float(high)),
         H_left=H[0],
         H_right=H[1],

@@ -16,9 +16,9 @@ from recon.io.cameras.opencv_yaml import write_opencv_calibration
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.cameras.ros import camera_info_paths, write_camera_info, write_kalibr
 from recon.look.fault import spread_pixels
+from recon.stereo.rectify.epipolar import as_raw
 from recon.stereo.rectify.lens import project_with_jacobian, rays_of
 from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
-from recon.stereo.rectify.row_alignment import as_raw
 
 CalibrationForm = Literal["recon", "opencv", "ros", "kalibr"]
 _NAMES: Final[dict[CalibrationForm, re.Pattern[str]]] = {  # the first that fits

@@ -53,7 +53,7 @@ class ReconstructedFrame:
     cloud: PointCloud  # its points in camera axes, filtered
     warnings: tuple[str, ...] = ()  # problems of the images that did not prevent a result
     rays: RayCloud | None = None  # its rays for the occupancy map; None if no map is made
-    rows_px: float | None = None  # epipolar error; NaN = unknown, None = not measured
+    epipolar_error_px: float | None = None  # epipolar error; NaN = unknown, None = not measured
     support: Support | None = None  # that both images belong together; None: not judged
 
     def unmapped(self) -> ReconstructedFrame:
@@ -71,9 +71,9 @@ class FrameReconstructor:
         *,
         threads: int | None = None,  # of the matcher; results do not depend on them
         stopwatch: Stopwatch | None = None,
-        check_rows: bool = False,  # of every frame: the cameras move against each other
+        check_epipolar: bool = False,  # of every frame: the cameras move against each other
     ) -> None:
-        self._config, self._check_rows = config, check_rows
+        self._config, self._check_epipolar = config, check_epipolar
         self._stopwatch = stopwatch or Stopwatch()
         rectifier = Rectifier(calibration, config.rectification)
         self.camera = rectifier.camera  # the rectified camera of all frames
@@ -111,9 +111,9 @@ class FrameReconstructor:
         """Reconstruct one pair of a drive that is rectified; every 50th is inspected."""
         inspected = ((), None) if rectified.index % _INSPECT_EVERY else self.inspect(rectified)
         frame = self._frame_of(rectified, self._observe(rectified), *inspected)
-        if not (self._check_rows and isinstance(rectified, RectifiedPair)):
+        if not (self._check_epipolar and isinstance(rectified, RectifiedPair)):
             return frame
-        return replace(frame, rows_px=inspect_pair(rectified).row_error_px)
+        return replace(frame, epipolar_error_px=inspect_pair(rectified).epipolar_error_px)
 
     def reconstruct_keyframe(self, frame: ReconstructedFrame) -> ReconstructedFrame:
         """Reconstruct a frame again, by the matcher of keyframes."""

@@ -16,8 +16,8 @@ from recon.core.text import counted
 from recon.core.values import RectifiedPair
 from recon.stereo.match.sad import HalfSizeMatcher, estimate_ndisp
 from recon.stereo.match.search import SearchSettings
+from recon.stereo.rectify.epipolar import count_aligned
 from recon.stereo.rectify.features import PairFeatures
-from recon.stereo.rectify.row_alignment import count_aligned
 
 _LEAST_ROWS: Final = 64  # lower images are not judged: hardly a feature fits in
 _SHIFT_ROWS: Final = 16

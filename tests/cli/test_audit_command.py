@@ -48,7 +48,7 @@ def test_a_good_drive_is_announced_measured_and_found_good(good, tmp_path):
         assert subject in done.stdout
     assert "not known" not in done.stdout
     page = (tmp_path / "audited" / "report.html").read_text()
-    for words in ("Verdict: good", "Row errors", "Disparity", "Exposure, focus and rows"):
+    for words in ("Verdict: good", "Epipolar errors", "Disparity", "Exposure, focus and rows"):
         assert words in page
     summary = json.loads((tmp_path / "audited" / "summary.json").read_text())
     assert summary["verdict"] == "good"
@@ -87,7 +87,7 @@ def test_what_it_mends_is_a_calibration_that_makes_the_drive_good(drive, tmp_pat
     assert json.loads(told.stdout)["mended"]["calibration"] == str(mended)
     again = json.loads(recon("audit", path, "--calib", mended, "--json", "--quiet").stdout)
     assert again["verdict"] == "good"
-    assert abs(again["row_error_mean_px"]) < 0.3
+    assert abs(again["epipolar_error_mean_px"]) < 0.3
     # The same file is what `recon map --calib` opens the drive with.
     source = open_source(path, settings=SourceSettings(calibration=str(mended)))
     assert source.calibration.baseline_m == pytest.approx(drive[1].baseline_m)

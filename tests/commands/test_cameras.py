@@ -236,7 +236,7 @@ def test_a_folder_is_rectified_by_its_features_and_says_up_to_scale(street, tmp_
     run_rectify(*sides, load_config(), out=tmp_path / "out", threads=1)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["up_to_scale"] is True
-    assert summary["row_error_px"] < 0.7
+    assert summary["epipolar_error_px"] < 0.7
     assert any("no metres" in line for line in summary["warnings"])
     assert not (tmp_path / "out" / "calibration.yaml").exists()
     images = {f"{side}/{number}.png" for side in ("left", "right") for number in (0, 1)}

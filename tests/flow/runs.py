@@ -17,7 +17,7 @@ from recon.look.fit import FittedFault
 from recon.look.rig import RefinedRig
 from recon.map.drive.mapper import FrameResult
 from recon.map.map import Map
-from recon.stereo.rectify.row_alignment import correct_rig
+from recon.stereo.rectify.epipolar import correct_rig
 
 ROOT = Path(__file__).parents[2]
 RECON = [sys.executable, "-m", "recon"]

@@ -32,7 +32,7 @@ from recon.places.detector import StoredKeyframe
 from recon.places.fixes import Fixes
 from recon.places.keyframe import Keyframe
 from recon.places.loop import Loop
-from recon.stereo.rectify.row_alignment import as_raw
+from recon.stereo.rectify.epipolar import as_raw
 from tests.hostile.refusals import refusal
 
 FRAMES: Final = 3

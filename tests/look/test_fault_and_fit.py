@@ -159,7 +159,7 @@ def test_the_calibration_without_a_fault_sees_what_is_left_of_it(rig, values):
     places = RigFault(camera).correct(uv, right_uv, values)
     off = right_uv - uv + places.left_uv - places.right_uv
     both = np.stack([off[..., 0], places.left_uv[..., 1] - places.right_uv[..., 1]])
-    found = np.stack([-change.off_px, change.rows_px])
+    found = np.stack([-change.off_px, change.epipolar_error_px])
     shown = np.isfinite(found)
     assert shown.mean() > 0.9
     assert rms(both[shown]) > 0.2

@@ -13,7 +13,7 @@ from recon.look.rig import RefinedRig
 from recon.odometry.prior import MotionPrior
 from recon.odometry.settings import PriorSettings, RigSettings
 from recon.sources.live import LiveSource
-from recon.stereo.rectify.row_alignment import as_raw
+from recon.stereo.rectify.epipolar import as_raw
 from recon.street.settings import StreetScene
 from tests.scenery.film import Film, film
 

@@ -14,7 +14,7 @@ from recon.look import measures
 from recon.look.findings import Finding, verdict_of
 from recon.look.sample import QUICK, THOROUGH, plan_windows
 from recon.look.tracks import REACH
-from recon.stereo.rectify.row_alignment import align_rows, correct_rig, count_aligned, turn_features
+from recon.stereo.rectify.epipolar import align_epipolar, correct_rig, count_aligned, turn_features
 
 CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
 
@@ -43,7 +43,7 @@ def features(rng, pitch_rad, roll_rad, wrong=0):
 def test_the_turn_that_mends_rows_is_found_among_wrong_matches(pitch_deg, roll_deg, wrong, seed):
     turn = np.radians([pitch_deg, roll_deg])
     left, right = features(np.random.default_rng(seed), *turn, wrong)
-    alignment = align_rows(left, right, CAMERA)
+    alignment = align_epipolar(left, right, CAMERA)
     # 0.2 px of noise over hundreds of features: a hundredth of a pixel, or 0.002 degrees.
     assert np.degrees(alignment.pitch_rad) == pytest.approx(pitch_deg, abs=0.02)
     assert np.degrees(alignment.roll_rad) == pytest.approx(roll_deg, abs=0.02)
@@ -54,17 +54,17 @@ def test_the_turn_that_mends_rows_is_found_among_wrong_matches(pitch_deg, roll_d
 
 def test_rows_that_correspond_have_no_error_but_noise_and_few_features_none():
     left, right = features(np.random.default_rng(1), 0.0, 0.0)
-    alignment = align_rows(left, right, CAMERA)
+    alignment = align_epipolar(left, right, CAMERA)
     assert alignment.rms_px < 0.05  # the noise of 0.2 px is taken away
     assert alignment.spread_px == pytest.approx(0.2, abs=0.03)
-    assert align_rows(left[:11], right[:11], CAMERA) is None
+    assert align_epipolar(left[:11], right[:11], CAMERA) is None
     assert count_aligned(left[:1], right[:1], CAMERA) == 0
 
 
 def test_a_mended_rig_projects_to_the_same_rows():
     turn = np.radians([0.5, -0.8])
     left, right = features(np.random.default_rng(3), *turn)
-    alignment = align_rows(left, right, CAMERA)
+    alignment = align_epipolar(left, right, CAMERA)
     rig = correct_rig(CAMERA, alignment.turn, np.eye(3))
     # Where the mended calibration says that a point lies is where the turned camera saw it.
     xyz = np.array([[0.4, -0.3, 6.0], [-1.0, 0.8, 9.0], [2.0, 0.1, 20.0]])

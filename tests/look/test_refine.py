@@ -20,8 +20,8 @@ from recon.odometry.visual import VisualOdometry
 from recon.sources.live import LiveSource
 from recon.sources.source import SourcePart, StereoSource
 from recon.stereo.frame import FrameReconstructor
+from recon.stereo.rectify.epipolar import correct_rig
 from recon.stereo.rectify.rectifier import turns_of
-from recon.stereo.rectify.row_alignment import correct_rig
 from recon.street.render import StreetCamera
 from recon.street.settings import StreetScene
 from recon.street.street import build_street

@@ -365,12 +365,12 @@ def test_each_view_of_a_calibration_has_its_error_and_corners(drawn):
     result: Any = SimpleNamespace(
         fit=fit,
         seen=SimpleNamespace(size_px=(80, 60)),
-        rows_px=np.linspace(-1, 1, 101),
+        epipolar_error_px=np.linspace(-1, 1, 101),
         summary={"coverage_left": 0.5, "coverage_right": 0.75},
     )
     calibration_page.errors_figure(result)
     calibration_page.coverage_figure(result)
-    calibration_page.rows_figure(result)
+    calibration_page.epipolar_figure(result)
     errors, (_, right), rows = drawn[0].axes[0], drawn[1].axes, drawn[2].axes[0]
     assert [bar.get_height() for bar in errors.patches] == [0.1, 0.3, 0.2, 0.4, 9.0]
     middles = [bar.get_x() + bar.get_width() / 2 for bar in errors.patches]
@@ -388,16 +388,16 @@ class Points(SimpleNamespace):
 
 
 def test_pairs_of_an_audit_are_drawn_by_frame(pair, drawn):
-    def look(index: int, rows_px: list[float]) -> Any:
-        features = Points(left_uv=np.arange(2.0 * len(rows_px)).reshape(-1, 2))
+    def look(index: int, epipolar_error_px: list[float]) -> Any:
+        features = Points(left_uv=np.arange(2.0 * len(epipolar_error_px)).reshape(-1, 2))
         return SimpleNamespace(
-            index=index, features=features, rows_px=np.array(rows_px),
+            index=index, features=features, epipolar_error_px=np.array(epipolar_error_px),
             brightness_dn=(90.0, 80.0 + index), sharpness=(0.5, 0.25),
         )  # fmt: skip
 
     looks = [look(0, [0.0, 1.0, 2.0]), look(4, [])]
     audit_page.frames_figure(looks)
-    audit_page.rows_figure(look(2, [0.5, 9.0]), pair)
+    audit_page.epipolar_figure(look(2, [0.5, 9.0]), pair)
     brightness, sharpness, rows = drawn[0].axes
     np.testing.assert_array_equal(brightness.lines[1].get_xydata(), [[0, 80], [4, 84]])
     assert (brightness.get_ylim(), sharpness.get_ylim()[0]) == ((0, 255), 0)

@@ -109,7 +109,7 @@ def audit_page(text: str = "plain", **changes: Any) -> str:
     content = {
         "source": SimpleNamespace(name=f"Source {text}", description=f"Description {text}"),
         "lines": {"frames": f"Frames {text}", f"Check {text}": f"Cell {text}"},
-        "found": {"baseline_m": 0.5, "row_error_rms_px": None, "depth_error_m": None},
+        "found": {"baseline_m": 0.5, "epipolar_error_rms_px": None, "depth_error_m": None},
         "rig": None,
         "frames": None,
         "pairs": [{**pair, "valid_percent": 75.0}],

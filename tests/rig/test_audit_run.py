@@ -45,7 +45,7 @@ def test_a_clean_drive_is_good_and_its_figures_are_right(street):
     audit = audit_source(street, CONFIG)
     assert (audit.verdict, audit.findings) == ("good", ())
     assert audit.figures["gain"] == pytest.approx(1, abs=0.02)
-    assert audit.figures["row_error_rms_px"] < 0.1
+    assert audit.figures["epipolar_error_rms_px"] < 0.1
     # 1 m a frame, ten frames a second.
     assert audit.figures["speed_m_per_s"] == pytest.approx(10, rel=0.05)
     assert audit.figures["frames_read"] == FRAMES
@@ -102,9 +102,9 @@ def assert_aligned(spoiled: faults.Spoiled, folder: Path) -> None:
     assert mended.baseline_m == pytest.approx(spoiled.camera.baseline_m, rel=1e-9)
     after = audit_source(replace(spoiled, camera=mended), CONFIG)
     assert "rows" not in {finding.code for finding in after.findings}
-    assert abs(after.figures["row_error_mean_px"]) < 0.3
-    assert after.figures["row_error_rms_px"] < 0.3
-    assert before.figures["row_error_rms_px"] > 5 * after.figures["row_error_rms_px"]
+    assert abs(after.figures["epipolar_error_mean_px"]) < 0.3
+    assert after.figures["epipolar_error_rms_px"] < 0.3
+    assert before.figures["epipolar_error_rms_px"] > 5 * after.figures["epipolar_error_rms_px"]
     # Mending what is mended changes next to nothing.
     assert abs(after.figures["mend_pitch_deg"]) < 0.02
 
@@ -222,4 +222,4 @@ def test_cameras_that_are_late_or_hang_are_measured_and_a_black_image_is_neither
     assert "black" not in codes(replace(street, take=once_black))
     alone = audit_source(replace(street, count=1), CONFIG)
     assert (alone.verdict, alone.figures["frames_read"]) == ("good", 1)
-    assert alone.figures["row_error_rms_px"] < 0.2
+    assert alone.figures["epipolar_error_rms_px"] < 0.2

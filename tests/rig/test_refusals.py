@@ -135,10 +135,10 @@ def test_a_rig_that_is_only_turned_or_one_odd_pair_is_rigid(street, fault):
 
 
 def test_too_few_pairs_say_nothing_of_the_rig():
-    rows_px = np.array([-9.0, 0.0, 9.0])
-    assert Rigidity((0, 9), rows_px[::2], rows_px[::2]).kept
-    assert not Rigidity((0, 5, 9), rows_px, rows_px).kept
-    assert Rigidity((0, 5, 9), rows_px, 0 * rows_px).kept
+    epipolar_error_px = np.array([-9.0, 0.0, 9.0])
+    assert Rigidity((0, 9), epipolar_error_px[::2], epipolar_error_px[::2]).kept
+    assert not Rigidity((0, 5, 9), epipolar_error_px, epipolar_error_px).kept
+    assert Rigidity((0, 5, 9), epipolar_error_px, 0 * epipolar_error_px).kept
 
 
 def test_a_drive_of_two_drives_is_refused_and_one_in_the_dark_is_not_for_that(street, tmp_path):

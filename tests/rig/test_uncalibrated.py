@@ -52,7 +52,7 @@ def test_rows_are_off_by_no_more_than_noise(turn, shift, exact_px, sigma_px):
     uv = map_pixels(found.H_left, truth.left_uv), map_pixels(found.H_right, truth.right_uv)
     assert np.abs(uv[0][:, 1] - uv[1][:, 1]).mean() < exact_px + 0.3 * sigma_px
     # Rows of both images are noisy: mean |N(0, 0.3 sqrt 2)|.
-    assert found.row_error_held_out_px == pytest.approx(1.13 * sigma_px, rel=0.3, abs=exact_px)
+    assert found.epipolar_error_held_out_px == pytest.approx(1.13 * sigma_px, rel=0.3, abs=exact_px)
     assert found.inliers > 0.95 * found.matches
     # Of the size of the recorded ones, whichever camera is the left one.
     assert np.ptp(uv[1][:, 1]) == pytest.approx(np.ptp(truth.right_uv[:, 1]), rel=0.25)
@@ -197,7 +197,10 @@ def test_a_pitched_right_camera_is_turned_back_and_nothing_else(first):
         oblique = np.array([[1.0, 0, -20], [0, 1, 12], [0, 0, 1]])
         pairs[0] = (pairs[0][0], cv2.warpPerspective(pairs[0][0], oblique, (400, 300)))
     found = rectify_images(pairs, count=600)
-    assert (found.model, found.row_error_before_px) == ("rotation", pytest.approx(3.1, abs=0.4))
+    assert (found.model, found.epipolar_error_before_px) == (
+        "rotation",
+        pytest.approx(3.1, abs=0.4),
+    )
     _, _, disparity = planes_pair((400, 300))
     assert np.abs(true_rows(found, np.eye(3), B, disparity)).max() < 0.3
     for H in (found.H_left, found.H_right):
@@ -210,7 +213,7 @@ def test_pairs_on_equal_rows_stay_as_they_are():
     assert found.model == "raw"
     assert np.array_equal(found.H_left, np.eye(3))
     assert np.array_equal(found.H_right, np.eye(3))
-    assert found.row_error_after_px == found.row_error_before_px
+    assert found.epipolar_error_after_px == found.epipolar_error_before_px
 
 
 @pytest.mark.real
@@ -225,6 +228,6 @@ def test_warped_middlebury_pairs_come_back_onto_rows_by_their_truth(recon_data, 
     A, B = shaken(size, reach, rng), shaken(size, reach, rng)
     seen = tuple(cv2.warpPerspective(p, H, size) for p, H in ((left, A), (right, B)))
     rows = true_rows(rectify_images([seen]), A, B, found.truth.values)
-    sys.stdout.write(f"{name} by {reach}: mean row error {np.abs(rows).mean():.3f} px\n")
+    sys.stdout.write(f"{name} by {reach}: mean epipolar error {np.abs(rows).mean():.3f} px\n")
     # Motorcycle and Pipes are 0.3 px off as they are published.
     assert np.abs(rows).mean() <= 0.7

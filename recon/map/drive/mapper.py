@@ -15,7 +15,7 @@ from recon.core.text import counted
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Float64, freeze, tree_of
 from recon.core.work import OneBehind, Stopwatch
-from recon.look.geometry import MOST_ROWS_PX
+from recon.look.geometry import MOST_EPIPOLAR_ERROR_PX
 from recon.map.builders import (
     CloudBuilder,
     OccupancyBuilder,
@@ -72,8 +72,11 @@ class Mapper:
         """Add the next frame, whose pose is known, and start its integration."""
         T_world_camera = registered.T_world_camera
         health = replace(registered.health, warnings=(*frame.warnings, *registered.health.warnings))
-        if frame.rows_px is not None and not abs(frame.rows_px) <= MOST_ROWS_PX:
-            note = f"left and right rows are {frame.rows_px:.0f} px apart"
+        if (
+            frame.epipolar_error_px is not None
+            and not abs(frame.epipolar_error_px) <= MOST_EPIPOLAR_ERROR_PX
+        ):
+            note = f"left and right rows are {frame.epipolar_error_px:.0f} px apart"
             health = replace(health, ok=False, notes=(*health.notes, note))
         # A hole in the map is better than wrong geometry.
         cloud = frame.cloud if health.ok else frame.cloud.select(np.zeros(0, np.intp))

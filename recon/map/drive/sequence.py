@@ -218,7 +218,7 @@ def map_sequence(
         config,
         threads=work.threads,
         stopwatch=work.stopwatch,
-        check_rows=not source.rigid,
+        check_epipolar=not source.rigid,
     )
     by_sfm = config.odometry.method == "sfm" and known_poses is None
     used = imu = None

@@ -32,7 +32,7 @@ from recon.look.fit import FittedFault
 from recon.look.rig import KnownRig
 from recon.odometry.protocol import OdometryHealth
 from recon.places.loop import Loop
-from recon.stereo.rectify.row_alignment import as_raw
+from recon.stereo.rectify.epipolar import as_raw
 
 Bytes = bytes | bytearray | memoryview
 _RAW: Final = "raw"

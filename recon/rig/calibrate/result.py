@@ -39,7 +39,7 @@ class CalibrationRun:
     fit: StereoFit
     spread: Spread
     turns: RectifyingTurns
-    rows_px: Float64  # (N,), row errors of all corners after rectification
+    epipolar_error_px: Float64  # (N,), epipolar errors of all corners after rectification
     summary: dict[str, Any]  # the figures of ``summary.json``
 
 
@@ -52,10 +52,10 @@ def describe_calibration(
     for left_px, right_px in map(shared_pixels, fit.views):
         left = turns.place(fit.calibration, left_px)
         rows.append(left[:, 1] - turns.place(fit.calibration, right_px, right=True)[:, 1])
-    rows_px = np.concatenate(rows)
-    summary = _summarise(seen, fit, spread, rows_px)
+    epipolar_error_px = np.concatenate(rows)
+    summary = _summarise(seen, fit, spread, epipolar_error_px)
     summary["rectified_focal_px"] = turns.camera.focal_px
-    return CalibrationRun(config, seen, fit, spread, turns, rows_px, summary)
+    return CalibrationRun(config, seen, fit, spread, turns, epipolar_error_px, summary)
 
 
 def write_calibration(
@@ -67,7 +67,7 @@ def write_calibration(
 
 
 def _summarise(
-    seen: BoardViews, fit: StereoFit, spread: Spread, rows_px: Float64
+    seen: BoardViews, fit: StereoFit, spread: Spread, epipolar_error_px: Float64
 ) -> dict[str, Any]:
     rig, away_m = fit.calibration, _distances_m(fit)
     # Angles between the board's normal and the optical axis of the left camera.
@@ -80,8 +80,8 @@ def _summarise(
         "stereo_rms_px": fit.rms_px,
         "left_rms_px": fit.alone_px[0],
         "right_rms_px": fit.alone_px[1],
-        "epipolar_px": float(np.abs(rows_px).mean()),
-        "epipolar_95_px": float(np.quantile(np.abs(rows_px), 0.95)),
+        "epipolar_px": float(np.abs(epipolar_error_px).mean()),
+        "epipolar_95_px": float(np.quantile(np.abs(epipolar_error_px), 0.95)),
         "baseline_m": rig.baseline_m,
         "baseline_interval_m": list(spread.baseline_m),
         "baseline_squares": rig.baseline_m / seen.board.square_m,

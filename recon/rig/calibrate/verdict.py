@@ -21,7 +21,7 @@ _USABLE: Final = 0.05
 _FEW_VIEWS: Final = 10
 _SMALL_COVERAGE: Final = 0.5
 _APART: Final = 2.0  # stereo error relative to that of each camera alone
-_ROWS_PX: Final = 1.0  # a block matcher loses most matches to a row error of one pixel
+_ROWS_PX: Final = 1.0  # a block matcher loses most matches to a epipolar error of one pixel
 _USUAL_BASELINE_M: Final = (0.01, 2.0)
 # What a good set of views has, used to say what another one lacks.
 _ENOUGH_VIEWS: Final = 20
@@ -40,7 +40,7 @@ _TEXTS: Final = {
     "coverage": "the board was seen in {percent:.0f} % of the {side} image: the lens is guessed "
     "elsewhere; show it in every corner",
     "together": "both cameras together fit worse than alone: not synchronised, or moved?",
-    "rows": "rows are {epipolar_95_px:.2f} px apart after rectification (95 % of the corners are "
+    "rows": "the epipolar error is {epipolar_95_px:.2f} px after rectification (95 % of the corners are "
     "better): matching fails there; is the board flat, does --model suit?",
     "baseline": "baseline is {baseline_m:.3g} m: are the squares really {square_mm:g} mm?",
     "square": "size of a square not given: every length is in squares; add it, as in :25mm",

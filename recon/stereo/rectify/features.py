@@ -24,7 +24,7 @@ _EXACT_RATIO: Final = 0.75
 _CONTRAST: Final = 0.02  # half of OpenCV's default: weak features are still located accurately
 _BLOCK: Final = 1024  # descriptors compared with all others at once
 _ROUGH_PX: Final = 3.0  # that features of coarse levels may be off; farther are wrong matches
-_ROWS_APART: Final = 12.0  # row error that the initial homographies may leave
+_ROWS_APART: Final = 12.0  # epipolar error that the initial homographies may leave
 MOST_FEATURES: Final = 8000  # maximum number of features per image, where a caller does not say
 
 
@@ -189,10 +189,10 @@ def _mutual_best(left: Float32, right: Float32) -> Int32:
 
 
 _NEAR_PX: Final = 1.0  # of smaller disparities: too far away to show that cameras are swapped
-_OUTLIER_PX: Final = 3.0  # between the row error of a wrong match and that of the others
+_OUTLIER_PX: Final = 3.0  # between the epipolar error of a wrong match and that of the others
 INSPECTED: Final = 1000  # maximum number of features per image of a pair that is inspected
 _MIN_FEATURES: Final = 40  # with fewer matched features there is no verdict
-_WARN_ROW_PX: Final = 1.0  # median row error that gives a warning, in pixels
+_WARN_EPIPOLAR_PX: Final = 1.0  # median epipolar error that gives a warning, in pixels
 _SWAPPED_SHARE: Final = 0.8  # of near features with negative disparity: swapped cameras
 
 
@@ -200,8 +200,8 @@ _SWAPPED_SHARE: Final = 0.8  # of near features with negative disparity: swapped
 class PairInspection:
     """How well a pair is rectified, from features matched over the whole image. NaN = unknown."""
 
-    features: int  # number of matched features that agree on one row error
-    row_error_px: float  # median of right minus left row; 0 if the rows are aligned
+    features: int  # number of matched features that agree on one epipolar error
+    epipolar_error_px: float  # median of right minus left row; 0 if the rows are aligned
     row_spread_px: float  # robust standard deviation of that (from the median absolute deviation)
     near: int  # number of features near enough to show whether the cameras are swapped
     #: Share of those with a negative disparity: about 0, or about 1 if the cameras are swapped.
@@ -244,12 +244,12 @@ def check_inspection(inspection: PairInspection, where: str | None = None) -> tu
             expected="farther left",
             hint="give the left camera's images first (or un-mirror the images)",
         )
-    if abs(inspection.row_error_px) >= _WARN_ROW_PX:
-        side = "low" if inspection.row_error_px > 0 else "high"
+    if abs(inspection.epipolar_error_px) >= _WARN_EPIPOLAR_PX:
+        side = "low" if inspection.epipolar_error_px > 0 else "high"
         line = (
-            "rows of left and right are not aligned: the right image is "
-            f"{abs(inspection.row_error_px):.0f} px too {side} (expected "
-            f"under {_WARN_ROW_PX:g} px); depth will be poor or wrong: recon audit --mend FILE "
+            "left and right rows are not aligned: the right image is "
+            f"{abs(inspection.epipolar_error_px):.0f} px too {side} (expected "
+            f"under {_WARN_EPIPOLAR_PX:g} px); depth will be poor or wrong: recon audit --mend FILE "
             "writes a calibration of the pairs that aligns them"
         )
         return (line,)
@@ -257,7 +257,7 @@ def check_inspection(inspection: PairInspection, where: str | None = None) -> tu
 
 
 def _agreeing(row_shift: Float32) -> Bool:
-    """Return bool (N,), features whose row error is close to the most common one."""
+    """Return bool (N,), features whose epipolar error is close to the most common one."""
     if not len(row_shift):
         return np.zeros(0, np.bool_)
     ordered = np.sort(row_shift)

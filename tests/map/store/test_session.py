@@ -25,7 +25,7 @@ from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
 from recon.places.loop import Loop
-from recon.stereo.rectify.row_alignment import as_raw
+from recon.stereo.rectify.epipolar import as_raw
 from tests.map.walls import CAMERA, CONFIG, drives
 
 GRAIN = RayGrain(0.1, 0.1 / 64, 25.0)

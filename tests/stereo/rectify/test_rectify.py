@@ -290,7 +290,7 @@ def test_a_good_pair_has_rows_that_correspond_whatever_wrong_matches_say():
     found = features.inspect_pair(pair)
     assert found.features > 100
     # A tenth of a pixel: cubic interpolation and one grey level of noise.
-    assert abs(found.row_error_px) < 0.1
+    assert abs(found.epipolar_error_px) < 0.1
     assert 0.0 <= found.row_spread_px < 0.3
     assert found.negative_share < 0.02
     assert features.check_inspection(found) == ()
@@ -303,7 +303,7 @@ def test_a_good_pair_has_rows_that_correspond_whatever_wrong_matches_say():
     right = left + np.float32([-10.0, 2.0]) + rng.normal(0, 0.2, left.shape).astype(np.float32)
     right[:120] = rng.uniform(0, 400, (120, 2))
     found = features.inspect_features(features.PairFeatures(left, right))
-    assert found.row_error_px == pytest.approx(2.0, abs=0.1)
+    assert found.epipolar_error_px == pytest.approx(2.0, abs=0.1)
     assert found.features == pytest.approx(180, abs=8)
 
 
@@ -311,11 +311,11 @@ def test_a_good_pair_has_rows_that_correspond_whatever_wrong_matches_say():
 def test_rows_that_are_off_are_measured_and_said_whatever_the_exposure(row_px):
     pair = wall_pair(row_px=row_px)
     darker = replace(pair, right=(pair.right // 2).astype(np.uint8))
-    assert features.inspect_pair(darker).row_error_px == pytest.approx(row_px, abs=0.3)
+    assert features.inspect_pair(darker).epipolar_error_px == pytest.approx(row_px, abs=0.3)
     found = features.inspect_pair(pair)
-    assert found.row_error_px == pytest.approx(row_px, abs=0.2)
+    assert found.epipolar_error_px == pytest.approx(row_px, abs=0.2)
     (line,) = features.check_inspection(found)
-    assert "rows of left and right are not aligned" in line
+    assert "left and right rows are not aligned" in line
     assert "recon audit --mend" in line
     assert f"{abs(row_px):.0f} px too {'low' if row_px > 0 else 'high'}" in line
 
@@ -333,7 +333,7 @@ def test_blank_images_other_scenes_and_one_at_infinity_give_no_answer():
     blank = np.full((240, 400), 255, np.uint8)
     found = features.inspect_pair(RectifiedPair(blank, blank, CAMERA))
     assert found.features == 0
-    assert np.isnan(found.row_error_px)
+    assert np.isnan(found.epipolar_error_px)
     far = features.inspect_pair(wall_pair(disparity_px=0.3))
     assert np.isnan(far.negative_share)
     strangers = features.inspect_pair(replace(wall_pair(seed=1), right=wall_pair(seed=2).right))

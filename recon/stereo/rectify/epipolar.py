@@ -1,4 +1,4 @@
-"""Row errors of a rectified pair, and the small rotation that corrects them.
+"""Epipolar errors of a rectified pair, and the small rotation that corrects them.
 
 Pitch of the right camera moves all rows alike, roll in proportion to the column. Yaw moves columns,
 which cannot be distinguished from disparity.
@@ -15,19 +15,21 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, Rig, StereoCalibration
 from recon.core.values.arrays import Bool, Float32, Float64
 
-_NEAR_PX: Final = 1.5  # features with a smaller row error after a rotation agree with it
+_NEAR_PX: Final = 1.5  # features with a smaller epipolar error after a rotation agree with it
 _TRIALS: Final = 300
 _REFITS: Final = 8
 
 
 @dataclass(frozen=True)
-class RowAlignment:
-    """Row errors (right minus left), and the rotation of the right camera that minimises them."""
+class EpipolarAlignment:
+    """Epipolar errors (right minus left), and the rotation of the right camera that minimises them."""
 
     agreeing: int  # number of features that agree with the rotation
-    mean_px: float  # mean row error of the agreeing features
-    spread_px: float  # standard deviation of their row error
-    rms_px: float  # root mean square row error without the feature noise; 0 if rows are aligned
+    mean_px: float  # mean epipolar error of the agreeing features
+    spread_px: float  # standard deviation of their epipolar error
+    rms_px: (
+        float  # root mean square epipolar error without the feature noise; 0 if rows are aligned
+    )
     residual_px: float  # robust standard deviation after the rotation: the feature noise
     pitch_rad: float  # correcting rotation about x
     roll_rad: float  # correcting rotation about z
@@ -42,7 +44,9 @@ class RowAlignment:
         return np.asarray(turn_features(right_uv, camera, self.turn[[0, 2]])[:, 1])
 
 
-def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> RowAlignment | None:
+def align_epipolar(
+    left_uv: Float32, right_uv: Float32, camera: RectifiedCamera
+) -> EpipolarAlignment | None:
     """Fit the rotation of the right camera that aligns the rows of features (N, 2).
 
     Some of them may be wrong matches. None if fewer than 12 agree.
@@ -66,7 +70,7 @@ def align_rows(left_uv: Float32, right_uv: Float32, camera: RectifiedCamera) -> 
     left_over = left_over[agree]
     error = (right_uv[:, 1] - left_uv[:, 1])[agree].astype(np.float64)
     noise = float(np.mean(left_over**2))
-    return RowAlignment(
+    return EpipolarAlignment(
         agreeing=int(agree.sum()),
         mean_px=float(error.mean()),
         spread_px=float(error.std()),
