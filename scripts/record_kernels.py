@@ -31,7 +31,7 @@ from recon.core.kernels.voxels import distinct_keys, pack_keys
 from recon.core.values import StereoPair
 from recon.io.models.octomap import read_octomap
 from recon.map.drive.sequence import MappedSequence, map_sequence
-from recon.map.occupancy.bodies import came_or_went
+from recon.map.occupancy.bodies import dynamic_cells
 from recon.map.tiles import Tiles
 from recon.run.finished import OCTOMAP
 from recon.sources.one_pair import PairInput
@@ -74,10 +74,12 @@ def map_drive(folder: Path) -> None:
 
 def look_for_what_moved(mapped: MappedSequence) -> None:
     """Ask what frames saw of the points of a drive, as if they had moved: here nothing does."""
-    looks = mapped.tiles.looks
+    observations = mapped.tiles.observations
     xyz = np.concatenate([tile.cloud.xyz for tile in mapped.tiles])
-    keys = distinct_keys(pack_keys(np.floor(xyz / looks.settings.resolution_m).astype(np.int64)))
-    came_or_went(keys, np.ones(len(keys), np.bool_), looks.at(keys))
+    keys = distinct_keys(
+        pack_keys(np.floor(xyz / observations.settings.resolution_m).astype(np.int64))
+    )
+    dynamic_cells(keys, np.ones(len(keys), np.bool_), observations.at(keys))
 
 
 def others(folder: Path) -> None:

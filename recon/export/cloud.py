@@ -80,7 +80,7 @@ def even_sample(tiles: Tiles) -> PointCloud:
 
 def _doubts(tiles: Tiles, points: int, removed: int) -> list[str]:
     """Return a warning where much was left out, or nothing could be."""
-    if tiles.config.fusion.remove_moving and tiles.looks is None:
+    if tiles.config.fusion.remove_moving and tiles.observations is None:
         what = "no rays were kept, so what moved stays in the cloud"
         return [f"{what}; map with --set occupancy.keep_rays=true to leave it out"]
     share = removed / max(points + removed, 1)

@@ -41,8 +41,12 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
         MappingError: A drive kept no rays, or the robot is lower than what counts as ground, or
             wider than a tile.
     """
-    robot, band, looks = placed.tiles.config.robot, placed.tiles.config.grid, placed.tiles.looks
-    if looks is None:
+    robot, band, observations = (
+        placed.tiles.config.robot,
+        placed.tiles.config.grid,
+        placed.tiles.observations,
+    )
+    if observations is None:
         hint = "map the drive with occupancy.keep_rays=true"
         raise MappingError("a costmap is made of rays, and a drive kept none", hint=hint)
     if robot.width_m > (tile_m := placed.tiles.config.submaps.tile_m):
@@ -65,7 +69,7 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
     def finish(grid: OccupancyGrid, ground: GroundSurface, passed: Int32) -> OccupancyGrid:
         raster = Raster(grid.origin_m, grid.resolution_m, grid.cells.shape)
         low, size = np.array(grid.origin_m), np.array(grid.cells.shape[::-1])
-        frames = looks.near(low, low + size * grid.resolution_m)
+        frames = observations.near(low, low + size * grid.resolution_m)
         relief = measure_relief(frames, ground, raster, band.min_height_m, focal_px)
         steps, slopes = judge(relief, robot)
         nonlocal seen, steep

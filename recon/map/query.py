@@ -71,12 +71,12 @@ def look_up(tiles: Tiles, xyz: ArrayLike) -> MapPlaces:
     cells = cells[known].astype(np.int64)
     state = np.full(len(places), UNKNOWN, np.int8)
     state[known] = _states(tiles, cells)
-    seen = None if tiles.looks is None else [np.zeros((0, 4), np.int64)]
-    if tiles.looks is not None and seen is not None and len(known):
+    seen = None if tiles.observations is None else [np.zeros((0, 4), np.int64)]
+    if tiles.observations is not None and seen is not None and len(known):
         keys, home = np.unique(pack_keys(cells), return_inverse=True)
-        for number, look in tiles.looks.by_frame(keys):
+        for number, look in tiles.observations.by_frame(keys):
             rows = np.flatnonzero(look[home])
-            frame = np.tile(tiles.looks.frames[number], (len(rows), 1))
+            frame = np.tile(tiles.observations.frames[number], (len(rows), 1))
             seen.append(np.column_stack([known[rows], frame, look[home[rows]]]))
     sightings = None if seen is None else np.concatenate(seen)
     return MapPlaces(places, state, _nearest(tiles, places), sightings)

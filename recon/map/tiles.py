@@ -28,7 +28,7 @@ from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter, Rectangle, TileKey, Til
 from recon.map.fusion import ALL, FusedPart, join_fused
 from recon.map.ground.surface import find_floors
 from recon.map.kernels.raycast import BLOCK_BITS
-from recon.map.occupancy.bodies import Looks
+from recon.map.occupancy.bodies import FrameObservations
 from recon.map.occupancy.moving import CellEvidence, cell_evidence, find_moved
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
@@ -88,7 +88,7 @@ class Tiles:
         self._parts = TileParts(self.edge_m, path)
         self._chain = DriveChain(self._parts)
         self._known: tuple[str, ...] = ALL
-        self._looks: Looks | None = None
+        self._observations: FrameObservations | None = None
         self.extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
         self.submap_of_frame: Int64 = np.zeros(0, np.int64)
 
@@ -134,13 +134,13 @@ class Tiles:
         return tiles if tiles._take(cut, drives) else None
 
     @property
-    def looks(self) -> Looks | None:
+    def observations(self) -> FrameObservations | None:
         """What single frames saw, without which nothing is taken out; None = it is not known."""
-        return self._looks
+        return self._observations
 
-    def with_looks(self, looks: Looks | None) -> Self:
-        """Leave out of clouds what ``looks`` show to have moved; None = nothing."""
-        self._looks = looks
+    def with_observations(self, observations: FrameObservations | None) -> Self:
+        """Leave out of clouds what ``observations`` show to have moved; None = nothing."""
+        self._observations = observations
         return self
 
     @property
@@ -272,13 +272,13 @@ class Tiles:
     def _moved_rows(self, key: TileKey, drive: int, fused: FusedPart) -> Bool:
         """Return which rows of what a drive fused in a tile and its margin are of what moved."""
         fusion = self.config.fusion
-        if not fusion.remove_moving or self._looks is None:
+        if not fusion.remove_moving or self._observations is None:
             return np.zeros(len(fused), np.bool_)
         points = apply(self._T_map_world, fused.points(fusion.voxel_m))
         counted = fused.enough(self._least_frames, fusion.voxel_m)
         voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
         sigma_m = fused.frame_sigma_m
-        return find_moved(points, sigma_m, counted, voxels, evidence, self._looks)
+        return find_moved(points, sigma_m, counted, voxels, evidence, self._observations)
 
 
 _EVIDENCE: Final = "evidence"

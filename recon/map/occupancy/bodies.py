@@ -32,7 +32,7 @@ from recon.map.builders import (
     OccupancySettings,
     frame_rays,
 )
-from recon.map.kernels.looks import count_look, rays_towards
+from recon.map.kernels.observations import count_observation, rays_towards
 from recon.map.kernels.raycast import (
     BLOCK_BITS,
     BLOCK_EDGE,
@@ -72,15 +72,15 @@ class _Seen(NamedTuple):
     differed: Int64
 
 
-def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
+def dynamic_cells(keys: Int64, placed: Bool, observations: Iterable[Int8]) -> Bool:
     """Return bool (N,), the cells of pieces of surface that were there at one time only.
 
     ``keys`` are sorted packed cells with points that were seen through as often as hit; ``placed``
-    those with points that their frames could place in one cell, the better evidence; ``looks`` what
+    those with points that their frames could place in one cell, the better evidence; ``observations`` what
     each frame saw in the cells, int8 (N,): 1 hit, -1 looked through, 0 neither.
     """
     pairs, upright = pairs_of(keys)
-    seen = _count(len(keys), pairs, looks)
+    seen = _count(len(keys), pairs, observations)
     piece = pieces_of(len(keys), pairs)
     ratio = _disagreement(seen, pairs, upright, placed, piece)[piece]
     known = np.isfinite(ratio)
@@ -103,11 +103,11 @@ def pairs_of(keys: Int64) -> tuple[Int64, Bool]:
     return np.concatenate(found), np.concatenate(upright)
 
 
-def _count(cells: int, pairs: Int64, looks: Iterable[Int8]) -> _Seen:
+def _count(cells: int, pairs: Int64, observations: Iterable[Int8]) -> _Seen:
     of_cells, before = np.zeros((3, cells), np.int64), np.zeros(cells, np.int8)
     of_pairs = np.zeros((2, len(pairs)), np.int64)
-    for look in looks:
-        count_look(look, before, of_cells, pairs, of_pairs)
+    for look in observations:
+        count_observation(look, before, of_cells, pairs, of_pairs)
     return _Seen(*of_cells, *of_pairs)
 
 
@@ -166,7 +166,7 @@ _KEPT_FRAMES: Final = 192
 """Frames whose rays stay in memory, some 0.3 MB each: a tile needs those near it more than once."""
 
 
-class Looks:
+class FrameObservations:
     """The frames of all drives of a map, in order, taken at ``T_map_camera`` (F, 4, 4).
 
     ``rays`` gives the kept rays of a frame by its number here, ``settings`` how they become
@@ -207,11 +207,11 @@ class Looks:
                 yield frame, wanted.seen_by(rays)
 
     @cached_property
-    def finest(self) -> Looks:
+    def finest(self) -> FrameObservations:
         """The same frames, in cells as fine as their rays are kept."""
         cell_m = self.settings.resolution_m / RAYS_PER_VOXEL
         settings = self.settings.model_copy(update={"resolution_m": cell_m})
-        return Looks(settings, self.T_map_camera, self._read)
+        return FrameObservations(settings, self.T_map_camera, self._read)
 
     @cached_property
     def disagreement(self) -> float:

@@ -39,7 +39,13 @@ from recon.map.builders import (
     MIN_PROBABILITY,
     MISS_PROBABILITY,
 )
-from recon.map.occupancy.bodies import Looks, came_or_went, pairs_of, pieces_of, strides
+from recon.map.occupancy.bodies import (
+    FrameObservations,
+    dynamic_cells,
+    pairs_of,
+    pieces_of,
+    strides,
+)
 from recon.map.occupancy.error import Reaches, still_there
 from recon.map.occupancy.part import OccupancyPart
 
@@ -85,13 +91,13 @@ def find_moved(
     counted: Bool,
     voxels: OccupancyVoxels,
     evidence: CellEvidence,
-    looks: Looks,
+    observations: FrameObservations,
 ) -> Bool:
     """Return bool (N,), the points (N, 3) fused by a drive that something left which has moved.
 
     ``sigma_m`` (N,) is the standard deviation of each in a frame; ``counted`` (N,) are those that
     enough frames saw, the voxels of others do not count. ``evidence`` is of the same drive;
-    ``voxels`` and ``looks`` are what all drives and their frames observed. All is in map axes.
+    ``voxels`` and ``observations`` are what all drives and their frames observed. All is in map axes.
     """
     places = points / voxels.resolution_m
     packed = pack_keys(np.floor(places).astype(np.int64))
@@ -101,10 +107,10 @@ def find_moved(
     occupied = pack_keys(voxels.keys[voxels.log_odds > 0])
     if moved.any():
         free = keys[moved]
-        reaches = Reaches(free, voxels.resolution_m, looks.disagreement)
-        frames = looks.by_frame(free)
-        seen = reaches.noting((looks.T_map_camera[frame], look) for frame, look in frames)
-        body = came_or_went(free, _among(home, counted & placed)[moved], seen)
+        reaches = Reaches(free, voxels.resolution_m, observations.disagreement)
+        frames = observations.by_frame(free)
+        seen = reaches.noting((observations.T_map_camera[frame], look) for frame, look in frames)
+        body = dynamic_cells(free, _among(home, counted & placed)[moved], seen)
         moved[moved], by_error = body, reaches.cells[body]
         for sigmas in _SIGMAS:
             rows = np.flatnonzero(moved)
@@ -119,10 +125,10 @@ def find_moved(
     unsure = np.flatnonzero(moved & ~placed)
     reach = FREE_MARGIN_SIGMAS * sigma_m[unsure] / voxels.resolution_m
     moved[unsure] = ~_in_reach(places[unsure], reach, occupied)
-    return moved | _left_below(points, packed, moved, looks.finest)
+    return moved | _left_below(points, packed, moved, observations.finest)
 
 
-def _left_below(points: Float64, packed: Int64, moved: Bool, finest: Looks) -> Bool:
+def _left_below(points: Float64, packed: Int64, moved: Bool, finest: FrameObservations) -> Bool:
     """Return bool (N,), points (N, 3) below those that moved whose finest cells were mostly free.
 
     ``packed`` (N,) are their voxels.

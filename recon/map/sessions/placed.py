@@ -24,7 +24,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.work import side_by_side
 from recon.io.files import resolved
 from recon.map.cut import Cutter, TileKey, TileParts
-from recon.map.occupancy.bodies import Looks
+from recon.map.occupancy.bodies import FrameObservations
 from recon.map.sessions.joining import seen_before
 from recon.map.settings import DriveSettings
 from recon.map.store.finished import CastSubmaps, check_rays
@@ -70,7 +70,7 @@ def place_map(map_: MapFile, settings: DriveSettings, threads: int = 1) -> Place
         placed.corrections,
         drives=placed.drives,
     )
-    return _with_path(map_, tiles.with_looks(_looks(map_, settings)))
+    return _with_path(map_, tiles.with_observations(_observations(map_, settings)))
 
 
 def place_map_on(
@@ -98,7 +98,7 @@ def place_map_on(
     files = [folder / f"tiles-{n}" for n in range(len(groups))]
     each(partial(_make_tiles, file, settings, taken), [*zip(groups, files, strict=True)])
     tiles.adopt(files)
-    return _with_path(map_, tiles.with_looks(_looks(map_, settings)))
+    return _with_path(map_, tiles.with_observations(_observations(map_, settings)))
 
 
 class PlacedSubmaps:
@@ -188,7 +188,7 @@ def _beside(
     return CastSubmaps(session, settings, map_.first.T_map_world, poses, without), moves
 
 
-def _looks(map_: MapFile, settings: DriveSettings) -> Looks | None:
+def _observations(map_: MapFile, settings: DriveSettings) -> FrameObservations | None:
     """Return what frames of the linked drives saw, by their rays; None where a drive kept none."""
     seen: list[tuple[Session, int]] = []
     poses = []
@@ -205,7 +205,7 @@ def _looks(map_: MapFile, settings: DriveSettings) -> Looks | None:
         return session.rays(frame)[0]
 
     names = [(session.number, frame) for session, frame in seen]
-    return Looks(settings.occupancy, np.concatenate(poses), rays, names)
+    return FrameObservations(settings.occupancy, np.concatenate(poses), rays, names)
 
 
 def _no_evidence(map_: MapFile, session: Session) -> frozenset[int]:
@@ -272,7 +272,7 @@ def _make_tiles(
     keys, file = task
     tiles = taken(path=file)
     with closing(MapFile.open(map_file)) as map_:
-        tiles.with_looks(_looks(map_, settings))
+        tiles.with_observations(_observations(map_, settings))
         for key in keys:
             tiles.make_voxels(key)
             tiles.cloud(key)

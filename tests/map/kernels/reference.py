@@ -267,7 +267,7 @@ def _crossing(edge, distance):
 
 
 def rays_towards_reference(xyz, cells, edge):
-    """Which points lie on rays that may cross cells, as `recon.map.kernels.looks` says."""
+    """Which points lie on rays that may cross cells, as `recon.map.kernels.observations` says."""
 
     def bins(slopes):
         return np.clip(np.floor((slopes + 1.5) * 128 / 3), 0, 127).astype(int)

@@ -21,7 +21,7 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSurface
-from recon.map.occupancy.bodies import Looks, came_or_went
+from recon.map.occupancy.bodies import FrameObservations, dynamic_cells
 from recon.map.occupancy.error import disagreement, frame_pairs, still_there
 from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
@@ -105,7 +105,9 @@ def _tiles(*drives: Drive, remove: bool = True) -> Tiles:
     tiles = Tiles.of_submaps(submaps, config, T_MAP_WORLD, drives=[1] * len(drives))
     poses = np.stack([pose for drive in drives for pose in drive.poses])
     rays = [cloud for drive in drives for cloud in drive.rays]
-    return tiles.with_looks(Looks(config.occupancy, T_MAP_WORLD @ poses, rays.__getitem__))
+    return tiles.with_observations(
+        FrameObservations(config.occupancy, T_MAP_WORLD @ poses, rays.__getitem__)
+    )
 
 
 def _clouds(*drives: Drive) -> list[PointCloud]:
@@ -269,7 +271,9 @@ def test_disagreement_is_the_error_of_an_inverse_depth(off_px):
     # One frame is right, the other as far off as two that err apart by the root of two.
     clouds = [thin_rays(_off(look(STREET, 0.0, n), n * off_px), CONFIG.occupancy) for n in (0, 1)]
     poses = np.stack([T_MAP_WORLD @ np.eye(4)] * 2)
-    error_px = Looks(CONFIG.occupancy, poses, clouds.__getitem__).disagreement * FOCAL_BASELINE
+    error_px = (
+        FrameObservations(CONFIG.occupancy, poses, clouds.__getitem__).disagreement * FOCAL_BASELINE
+    )
     # A median of sizes is that of the shift, as soon as it is larger than the noise.
     assert np.hypot(0.5 * SIGMA_PX, off_px) <= error_px <= 1.2 * np.hypot(SIGMA_PX, 1.1 * off_px)
 
@@ -369,7 +373,7 @@ def _judged(cells: np.ndarray, seen: np.ndarray, placed: np.ndarray | None = Non
     order = np.argsort(keys)
     sure = np.ones(len(cells), np.bool_) if placed is None else placed
     judged = np.zeros(len(cells), np.bool_)
-    judged[order] = came_or_went(keys[order], sure[order], seen[:, order].astype(np.int8))
+    judged[order] = dynamic_cells(keys[order], sure[order], seen[:, order].astype(np.int8))
     return judged
 
 
@@ -451,10 +455,12 @@ def test_chosen_rays_see_in_cells_what_all_rays_see():
     ends = [apply(T, cloud.xyz[::50]) for T, cloud in zip(poses, clouds, strict=True)]
     hit = np.floor(np.concatenate(ends) / CONFIG.occupancy.resolution_m).astype(np.int64)
     cells = np.unique(np.concatenate([rng.integers(-40, 40, (4000, 3)), hit]), axis=0)
-    looks = np.stack(list(Looks(CONFIG.occupancy, poses, rays.__getitem__).at(pack_keys(cells))))
-    assert len(looks) == len(poses)
-    assert min((looks == sign).sum() for sign in (-1, 0, 1)) > 100
-    for T, cloud, look in zip(poses, rays, looks, strict=True):
+    observations = np.stack(
+        list(FrameObservations(CONFIG.occupancy, poses, rays.__getitem__).at(pack_keys(cells)))
+    )
+    assert len(observations) == len(poses)
+    assert min((observations == sign).sum() for sign in (-1, 0, 1)) > 100
+    for T, cloud, look in zip(poses, rays, observations, strict=True):
         builder = OccupancyBuilder(CONFIG.occupancy, np.eye(4))
         builder.integrate(cloud.cloud(), T)
         seen = replace(builder.part(), points=None).voxels(CONFIG.occupancy.resolution_m)
@@ -475,7 +481,7 @@ def test_frames_that_are_too_far_away_or_look_elsewhere_are_not_read():
         return rays[number]
 
     ahead = pack_keys(np.array([[0, 0, 40]]))
-    assert len(list(Looks(CONFIG.occupancy, poses, reading).at(ahead))) == 1
+    assert len(list(FrameObservations(CONFIG.occupancy, poses, reading).at(ahead))) == 1
     assert read == [0]
     behind = pack_keys(np.array([[0, 0, -40]]))
-    assert not list(Looks(CONFIG.occupancy, poses, reading).at(behind))
+    assert not list(FrameObservations(CONFIG.occupancy, poses, reading).at(behind))

@@ -67,7 +67,9 @@ def _bin(slope: float) -> int:
 
 
 @kernel
-def count_look(look: Int8, before: Int8, cells: Int64, pairs: Int64, of_pairs: Int64) -> None:
+def count_observation(
+    look: Int8, before: Int8, cells: Int64, pairs: Int64, of_pairs: Int64
+) -> None:
     """Add what one frame saw to the counts over frames, in place.
 
     Args:

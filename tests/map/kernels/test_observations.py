@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recon.map.kernels import raycast
-from recon.map.kernels.looks import count_look, rays_towards
+from recon.map.kernels.observations import count_observation, rays_towards
 from tests.map.kernels import reference
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -84,7 +84,7 @@ def test_looks_are_counted_as_by_the_reference(seed, frames, cells):
     of_cells, of_pairs = np.zeros((3, cells), np.int64), np.zeros((2, 5), np.int64)
     before = np.zeros(cells, np.int8)
     for look in looks:
-        count_look(look, before, of_cells, pairs, of_pairs)
+        count_observation(look, before, of_cells, pairs, of_pairs)
     expected = reference.counts_reference(looks, pairs)
     np.testing.assert_array_equal(of_cells, expected[0])
     np.testing.assert_array_equal(of_pairs, expected[1])
