@@ -44,7 +44,7 @@ from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
 NOISE_DN = 4.0
-EXPOSURE_SHARE = 0.15
+EXPOSURE_RATIO = 0.15
 RIGHT_GAIN = 0.93
 KEPT_WIDTH = 0.6
 NOD_DEG = 4.0
@@ -239,7 +239,7 @@ def narrowed(plain: Altered) -> Altered:
 def noisy(index: int, left: UInt8, right: UInt8) -> tuple[UInt8, UInt8]:
     """Image noise, varying exposure and a darker right camera."""
     random = np.random.default_rng(index)
-    gain = 1.0 + EXPOSURE_SHARE * np.sin(index / 7.0)
+    gain = 1.0 + EXPOSURE_RATIO * np.sin(index / 7.0)
     seen = (gain * left, gain * RIGHT_GAIN * right)
     dark, darker = (
         np.clip(np.rint(image + random.normal(0.0, NOISE_DN, image.shape)), 0, 255).astype(np.uint8)

@@ -215,7 +215,7 @@ def judge(
         ]
     )
     percent = found.segment_percent[whole]
-    limit = float("nan") if expected is None else 100.0 * expected.radius_share
+    limit = float("nan") if expected is None else 100.0 * expected.radius_ratio
     return {
         "drive": name,
         "segments": len(percent),
@@ -232,13 +232,13 @@ def judge(
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Share of covered segments: each drive counts as much as another."""
-    shares = [row["covered"] / row["segments"] for row in rows if row["segments"]]
+    """Fraction of covered segments: each drive counts as much as another."""
+    ratios = [row["covered"] / row["segments"] for row in rows if row["segments"]]
     sizes = [row["sigmas"] for row in rows if row["sigmas"] is not None]
     return {
-        "covered": round(float(np.mean(shares)), 3),
+        "covered": round(float(np.mean(ratios)), 3),
         "rms_sigmas": round(float(np.sqrt(np.mean(np.square(sizes)))), 3),
-        "drives_that_count": len(shares),
+        "drives_that_count": len(ratios),
     }
 
 

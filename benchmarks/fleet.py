@@ -245,7 +245,7 @@ def simulated(workers: int, count: int, seconds: float) -> dict[str, Any]:
         while len(cluster.workers) < workers:
             time.sleep(1)
         list(cluster.run([Job("first", "sleep", "", ("0",), True, "")], Path()))
-        idle = idle_share(process)
+        idle = idle_ratio(process)
         before, begun, own = process_s(process), time.perf_counter(), time.process_time()
         for done, _ in enumerate(cluster.run(jobs, Path()), start=1):
             took = time.perf_counter() - begun
@@ -279,8 +279,8 @@ def sleep(job: Job, folder: str) -> Outcome:
     return Outcome("succeeded")
 
 
-def idle_share(process: psutil.Process, seconds: float = 10.0) -> float:
-    """Share of a core that the heartbeats of the workers take."""
+def idle_ratio(process: psutil.Process, seconds: float = 10.0) -> float:
+    """Fraction of a core that the heartbeats of the workers take."""
     before = process_s(process)
     time.sleep(seconds)
     return (process_s(process) - before) / seconds

@@ -71,7 +71,7 @@ class Drifting:
     """
 
     inner: Odometry
-    share: float
+    ratio: float
     turn_deg_per_m: float
 
     def __post_init__(self) -> None:
@@ -83,7 +83,7 @@ class Drifting:
         step = se3.invert(self._true) @ result.T_world_camera
         angle = np.radians(self.turn_deg_per_m) * float(np.linalg.norm(step[:3, 3]))
         turn = step[:3, :3] @ se3.exp_so3(np.array([0.0, angle, 0.0]))
-        longer = se3.make_transform(turn, (1.0 + self.share) * step[:3, 3])
+        longer = se3.make_transform(turn, (1.0 + self.ratio) * step[:3, 3])
         self._true = result.T_world_camera
         self._drifted = se3.orthonormalise(self._drifted @ longer)
         return OdometryResult(self._drifted.copy(), result.health)

@@ -216,13 +216,13 @@ def split(keys: Int64, occupied: Any) -> dict[str, Int64]:
 
 def agreement(one: dict[str, Int64], other: dict[str, Int64]) -> dict[str, float]:
     """Intersection over union of the cells by kind, and the number of cells of ``one``."""
-    shares: dict[str, float] = {}
+    ratios: dict[str, float] = {}
     for kind, cells in one.items():
         both = len(np.intersect1d(cells, other[kind], assume_unique=True))
         either = len(cells) + len(other[kind]) - both
-        shares[kind] = round(both / either, 5)
-        shares[f"{kind}_cells"] = len(cells)
-    return shares
+        ratios[kind] = round(both / either, 5)
+        ratios[f"{kind}_cells"] = len(cells)
+    return ratios
 
 
 def table(result: dict[str, Any]) -> str:

@@ -138,7 +138,7 @@ def compare_halves(folder: Path, middle: int, truth: Trajectory | None) -> dict[
 
 
 def differing_cells(one: OccupancyGrid, other: OccupancyGrid) -> dict[str, float]:
-    """Shares of the cells known to either that differ, by what the two say."""
+    """Fractions of the cells known to either that differ, by what the two say."""
     ours, theirs = overlaid(one, other)
     known = (ours != UNKNOWN) | (theirs != UNKNOWN)
     opposite = ((ours == FREE) & (theirs == OCCUPIED)) | ((ours == OCCUPIED) & (theirs == FREE))

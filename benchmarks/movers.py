@@ -158,7 +158,7 @@ class Truth:
         self.reach_m = reach_m
 
     def score(self, before: PointCloud, after: PointCloud) -> dict[str, Any]:
-        """Return the shares of points that are gone."""
+        """Return the fractions of points that are gone."""
         left = distances(after.xyz, before.xyz) < 0.01
         from_standing = self.standing.distance(before.xyz)
         from_moving = np.full(len(before), np.inf)
@@ -169,12 +169,12 @@ class Truth:
         stands = (from_standing <= ON_IT_M) & (from_moving > BESIDE_M)
         found = {
             "moving_points": int(moves.sum()),
-            "moving_gone": share(~left[moves]),
+            "moving_gone": ratio(~left[moves]),
             "static_points": int(stands.sum()),
-            "static_lost": share(~left[stands]),
+            "static_lost": ratio(~left[stands]),
         }
         thin = stands & (self.thin.distance(before.xyz) <= ON_IT_M)
-        return found | {"thin_points": int(thin.sum()), "thin_lost": share(~left[thin])}
+        return found | {"thin_points": int(thin.sum()), "thin_lost": ratio(~left[thin])}
 
 
 class Surface:
@@ -203,7 +203,7 @@ def distances(targets: Any, points: Any) -> Float64:
     return np.asarray(one.compute_point_cloud_distance(other))
 
 
-def share(which: Bool) -> float | None:
+def ratio(which: Bool) -> float | None:
     return round(float(which.mean()), 4) if len(which) else None
 
 

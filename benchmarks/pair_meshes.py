@@ -1,10 +1,10 @@
 """How true the surface of a pair is: that of its pixels, and that of MeshLab's Poisson.
 
 Of every pixel with a known disparity, the ray is followed to the surface. ``covered`` is the share
-of the rays that meet it, ``within 1 px`` the share of all that meet it where it is, as a disparity;
-mean and 95 % are of those that meet it. ``on points`` is the share of the points that lie on it.
+of the rays that meet it, ``within 1 px`` the fraction of all that meet it where it is, as a disparity;
+mean and 95 % are of those that meet it. ``on points`` is the fraction of the points that lie on it.
 Triangles within which the depth changes much are curtains between surfaces, or surfaces that are
-seen along themselves: ``over 10 %`` and ``over 20 %`` are their shares of the area.
+seen along themselves: ``over 10 %`` and ``over 20 %`` are their fractions of the area.
 
 Of a drive, the first pair is taken; without a truth, there are fewer figures.
 
@@ -58,7 +58,7 @@ def measure(mesh: TriangleMesh, camera: RectifiedCamera, truth_px: Float64) -> d
 
 
 def changes(mesh: TriangleMesh) -> dict[str, float]:
-    """Shares of the area of a mesh whose triangles change depth by more than 10 and 20 %."""
+    """Fractions of the area of a mesh whose triangles change depth by more than 10 and 20 %."""
     a, b, c = mesh.vertices[mesh.faces].astype(np.float64).transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     depth_m = np.stack([a[:, 2], b[:, 2], c[:, 2]])

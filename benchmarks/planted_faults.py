@@ -49,9 +49,9 @@ def planted(name: str, rig: StereoCalibration) -> StereoCalibration:
         values[at] = RigFault(turns.camera).sigmas[at]  # moves the corners by a pixel
     else:
         what, amount = name.split()[:2]
-        share = what == "focal"
-        at = NAMES.index("zoom" if share else "yaw")
-        values[at] = 0.01 * float(amount) if share else np.radians(float(amount.rstrip("°")))
+        ratio = what == "focal"
+        at = NAMES.index("zoom" if ratio else "yaw")
+        values[at] = 0.01 * float(amount) if ratio else np.radians(float(amount.rstrip("°")))
     return without_fault(rig, turns, values)
 
 

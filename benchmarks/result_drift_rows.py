@@ -6,7 +6,7 @@ from typing import Any
 
 Found = dict[str, Any]
 Rows = dict[str, dict[str, Any]]
-TRUTH = "truth's share"
+TRUTH = "truth's ratio"
 PEERS = ("ORB-SLAM3", "COLMAP")  # of the first there are poses of all rows
 OF_TRUTH = ", truth"  # how the commands end that print it
 SHOWN = ("10", "50", "t_rel")  # lengths of segments; the command prints more
@@ -17,10 +17,10 @@ def drift(found: Found) -> Rows:
     rows: Rows = {}
     for drive in [name.removesuffix(" visual") for name in found if name.endswith(" visual")]:
         one, many = found[f"{drive} visual"], found[f"{drive} kiss"]["spread"]
-        path, share = one["trajectory"], truths_share(found[f"{drive}{OF_TRUTH}"])
+        path, ratio = one["trajectory"], truths_ratio(found[f"{drive}{OF_TRUTH}"])
         rows[f"{drive}, `visual`"] = {
             "t_rel": path["t_rel_percent"],
-            TRUTH: share,
+            TRUTH: ratio,
             "r_rel": path["r_rel_deg_per_100m"],
             "ATE": 100 * path["ate_m"],
             "not trusted": one["frames_not_trusted"],
@@ -28,7 +28,7 @@ def drift(found: Found) -> Rows:
         t_rel = many["t_rel_percent"]
         rows[f"{drive}, `kiss`"] = {
             "t_rel": t_rel["median"],
-            TRUTH: share,
+            TRUTH: ratio,
             "least to most": f"{t_rel['least']:.2f} to {t_rel['most']:.2f} %",
             "r_rel": many["r_rel_deg_per_100m"]["median"],
             "ATE": 100 * many["ate_m"]["median"],
@@ -42,7 +42,7 @@ def lenses(found: Found) -> Rows:
     rows: Rows = {}
     for label, one in found.items():
         if label.endswith(OF_TRUTH):
-            rows[label.removesuffix(OF_TRUTH)][TRUTH] = truths_share(one)
+            rows[label.removesuffix(OF_TRUTH)][TRUTH] = truths_ratio(one)
             continue
         path = one.get("trajectory")
         if path is None:
@@ -65,7 +65,7 @@ def altered(found: Found) -> Rows:
         for case, one in cases.items():
             row = rows.setdefault(f"{drive}, {case}", {})
             if label.endswith(OF_TRUTH):
-                row[TRUTH] = truths_share(cases, case)
+                row[TRUTH] = truths_ratio(cases, case)
                 continue
             row["refined" if how.startswith("refined") else "as calibrated"] = one["t_rel_percent"]
             row["length"] = one["scale"]
@@ -74,7 +74,7 @@ def altered(found: Found) -> Rows:
     return rows
 
 
-def truths_share(one: Found, row: str = "as it is") -> str | None:
+def truths_ratio(one: Found, row: str = "as it is") -> str | None:
     """The error of the truth over the segments of t_rel, by ours and the peer of all rows."""
     if row not in one:
         return None

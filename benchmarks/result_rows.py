@@ -9,7 +9,7 @@ from __future__ import annotations
 from math import hypot
 from statistics import median
 
-from result_drift_rows import OF_TRUTH, TRUTH, Found, Rows, truths_share
+from result_drift_rows import OF_TRUTH, TRUTH, Found, Rows, truths_ratio
 
 
 def lidar(found: Found) -> Rows:
@@ -52,7 +52,7 @@ def planted(found: Found) -> Rows:
     for drive, faults in found.items():
         if drive.endswith(OF_TRUTH):
             continue
-        share, without = found.get(f"{drive}{OF_TRUTH}", {}), faults["none"].get("t_rel_percent")
+        ratio, without = found.get(f"{drive}{OF_TRUTH}", {}), faults["none"].get("t_rel_percent")
         for name, one in faults.items():
             if name == "none":
                 continue
@@ -63,7 +63,7 @@ def planted(found: Found) -> Rows:
             }
             if without is not None:
                 row |= {"t_rel": one["t_rel_percent"], "without it": without}
-                row[TRUTH] = truths_share(share)
+                row[TRUTH] = truths_ratio(ratio)
     return rows
 
 
@@ -91,7 +91,7 @@ def intervals(found: Found) -> Rows:
 
 def rig_intervals(found: Found) -> Rows:
     one = found["streets"]
-    held = {name: 100 * share for name, share in one["held"].items()}
+    held = {name: 100 * ratio for name, ratio in one["held"].items()}
     return {
         f"{len(one['drives'])} rendered drives": {
             **held,
@@ -198,7 +198,7 @@ def halves(found: Found) -> Rows:
         "kitti_raw_0013": {
             "t_rel, one run": one["t_rel_percent"]["one run"],
             "merged": one["t_rel_percent"]["merged"],
-            TRUTH: truths_share(found["truth"]),
+            TRUTH: truths_ratio(found["truth"]),
             "paths apart": 1000 * one["path_apart_m"],
             "cells that differ": 100 * one["grid"]["differ"],
             "free against occupied": 100 * one["grid"]["free_against_occupied"],
@@ -220,8 +220,8 @@ def movers(found: Found) -> Rows:
     }
 
 
-def percent(share: float | None) -> float | None:
-    return None if share is None else 100 * share
+def percent(ratio: float | None) -> float | None:
+    return None if ratio is None else 100 * ratio
 
 
 def matching(found: Found) -> Rows:
@@ -267,7 +267,7 @@ def live(found: Found) -> Rows:
             "dropped": played["frames_dropped"],
             "tracked, not matched": played["frames_not_matched"],
             "t_rel": played["t_rel_percent"],
-            TRUTH: truths_share(found["truth"]),
+            TRUTH: truths_ratio(found["truth"]),
             "memory": played["peak_memory_mb"],
         }
         for rate, played in one["rates"].items()

@@ -47,7 +47,7 @@ PLACES: Final = {
     "corner": (1.0, 1.0), "left": (0.5, 0.07), "right": (0.5, 1.0), "top": (0.0, 0.5),
     "centre": (0.5, 0.5),
 }  # fmt: skip
-"""Where disparities are judged, as shares of height and width; the right image sees all of it."""
+"""Where disparities are judged, as fractions of height and width; the right image sees all of it."""
 
 
 class Noisy(StereoSource):
@@ -107,7 +107,7 @@ def judge(drive: Planted) -> dict[str, Any] | None:
     given = without_fault(true, turns_of(true, config.rectification), drive.fault)
     source = Noisy(pairs, given, drive.number)
     rig = refine_rig(source, config, RigSettings())
-    if (fitted := rig.fitted) is None or (length_share := rig.length_share) is None:
+    if (fitted := rig.fitted) is None or (length_ratio := rig.length_ratio) is None:
         return None
     planted, left = (
         compare_rigs(one, true, DEPTHS_M[0], config.rectification)
@@ -115,7 +115,7 @@ def judge(drive: Planted) -> dict[str, Any] | None:
     )
     camera = turns_of(rig.calibration, config.rectification).camera
     parameters = (fitted.values + drive.fault) / np.sqrt(np.diag(fitted.covariance))
-    longer = path_share(source, rig.calibration) / length_share
+    longer = path_ratio(source, rig.calibration) / length_ratio
     return {
         "drive": drive.number,
         "planted_px": round(planted.rms_px, 3),
@@ -125,8 +125,8 @@ def judge(drive: Planted) -> dict[str, Any] | None:
     }
 
 
-def path_share(source: Noisy, rig: Rig) -> float:
-    """Return by what share the path of a rig is longer than that of the true one."""
+def path_ratio(source: Noisy, rig: Rig) -> float:
+    """Return by what ratio the path of a rig is longer than that of the true one."""
     lengths_m = []
     for calibration in (rig, street(source.number % STREETS)[1]):
         odometry = make_odometry("visual")
@@ -146,11 +146,11 @@ def sigmas_of(camera: RectifiedCamera, fitted: FittedFault, off_px: Float64) -> 
     seen = RigFault(camera).correct(uv, uv, np.zeros(len(NAMES)))
     by = (seen.by_left - seen.by_right)[..., 0, :]
     sigma_px = np.sqrt(np.einsum("...i,ij,...j->...", by, fitted.covariance, by))
-    shares = off_px / sigma_px
+    ratios = off_px / sigma_px
     at = {name: (int(v * (rows - 1)), int(u * (columns - 1))) for name, (v, u) in PLACES.items()}
     mean = by.reshape(-1, len(NAMES)).mean(axis=0)
     return {
-        **{name: round(float(shares[place]), 2) for name, place in at.items()},
+        **{name: round(float(ratios[place]), 2) for name, place in at.items()},
         "mean": round(float(np.nanmean(off_px) / np.sqrt(mean @ fitted.covariance @ mean)), 2),
     }
 
@@ -170,7 +170,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the shares of intervals that hold, and of the disparity error that is left."""
+    """Return the fractions of intervals that hold, and of the disparity error that is left."""
     names = list(rows[0]["sigmas"])
     held = {name: np.abs([row["sigmas"][name] for row in rows]) <= SIGMAS for name in names}
     known = np.abs([list(row["parameters"].values()) for row in rows]) <= SIGMAS

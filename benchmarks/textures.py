@@ -96,13 +96,13 @@ def compare(
     eye = view.T_map_camera[:3, 3]
     face = scene.first_hit(eye, rays)
     hit = face >= 0
-    shares, depth = shares_at(mesh, face[hit], eye, rays[hit])
+    ratios, depth = ratios_at(mesh, face[hit], eye, rays[hit])
     texture = textured.texture
     if texture is None or mesh.rgb is None:
         raise LookupError("a surface has no colours")
-    uv = np.einsum("nc,ncd->nd", shares, texture.uv[textured.faces[face[hit]]])
+    uv = np.einsum("nc,ncd->nd", ratios, texture.uv[textured.faces[face[hit]]])
     colours = {
-        "vertices": np.einsum("nc,ncd->nd", shares, mesh.rgb[mesh.faces[face[hit]]]),
+        "vertices": np.einsum("nc,ncd->nd", ratios, mesh.rgb[mesh.faces[face[hit]]]),
         "texture": looked_up(texture.image, uv),
     }
     mask, found = hit.reshape(view.image.shape[:2]), {"covered": float(hit.mean())}
@@ -133,7 +133,7 @@ def from_steps(mask: Any, depth: Float64, camera: RectifiedCamera) -> Any:
     return cv2.distanceTransform(smooth.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
-def shares_at(
+def ratios_at(
     mesh: TriangleMesh, face: Any, eye: Float64, rays: Float64
 ) -> tuple[Float64, Float64]:
     """How much each corner of its face counts where a ray meets it: (N, 3); and its depth."""
@@ -144,8 +144,8 @@ def shares_at(
     size = np.einsum("ij,ij->i", normal, normal)
     second = np.einsum("ij,ij->i", np.cross(at - a, c - a), normal) / size
     third = np.einsum("ij,ij->i", np.cross(b - a, at - a), normal) / size
-    shares = np.clip(np.stack([1 - second - third, second, third], axis=1), 0, 1)
-    return np.asarray(shares), np.asarray(depth)
+    ratios = np.clip(np.stack([1 - second - third, second, third], axis=1), 0, 1)
+    return np.asarray(ratios), np.asarray(depth)
 
 
 def looked_up(image: UInt8, uv: Float64) -> Any:

@@ -233,13 +233,13 @@ def table(found: dict[str, Any]) -> str:
     lines = [f"{'free / obstacle / unknown':30s}" + "".join(f"{name:>18s}" for name in bands())]
     for vehicle, one in found.items():
         for kind, cells in one["cells"].items():
-            texts = [shares(cells[name]) for name in bands()]
+            texts = [ratios(cells[name]) for name in bands()]
             lines.append(f"{vehicle + ', ' + kind:30s}" + "".join(f"{t:>18s}" for t in texts))
         lines += [f"{vehicle}: {name}: {n}" for name, n in one.items() if name != "cells"]
     return "\n".join(lines)
 
 
-def shares(cells: Counter[str]) -> str:
+def ratios(cells: Counter[str]) -> str:
     counted = [cells.get(state, 0) for state in ("free", "obstacle", "unknown")]
     return " / ".join(f"{100 * n / sum(counted):.0f}" for n in counted) if sum(counted) else ""
 

@@ -32,7 +32,7 @@ def batch(
     threads: Annotated[
         int | None,
         opt.option(
-            "Threads of each job.", default="a share of the cores; on a scheduler, all", min=1
+            "Threads of each job.", default="a fraction of the cores; on a scheduler, all", min=1
         ),
     ] = None,
     memory_limit: Annotated[

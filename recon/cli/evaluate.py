@@ -138,7 +138,7 @@ def disparity(
         return
     shown = dict(figures)
     for kind in ("sparse", "dense"):
-        flat = {f"bad {limit}": share for limit, share in figures[kind]["bad"].items()}
+        flat = {f"bad {limit}": ratio for limit, ratio in figures[kind]["bad"].items()}
         shown |= {f"{kind} {name}": value for name, value in (flat | figures[kind]).items()}
     rated = figures.get("confidence", {})
     shown |= {f"confidence {name}": rated[name] for name in ("ece", "ause") if name in rated}

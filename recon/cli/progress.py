@@ -187,7 +187,7 @@ class ProgressBar:
 
 
 _BAR: Final = range(5, 41)  # cells of a bar; where there is less room there is none
-_NAME_SHARE: Final = 0.3  # share of the line that a name gets at least, where it is that long
+_NAME_RATIO: Final = 0.3  # fraction of the line that a name gets at least, where it is that long
 
 
 class FittingColumn(ProgressColumn):
@@ -225,7 +225,7 @@ class _Line:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         room = options.max_width - 1  # some terminals wrap in the last cell
-        name = min(self.name.cell_len, int(_NAME_SHARE * room))
+        name = min(self.name.cell_len, int(_NAME_RATIO * room))
         shown = list(self.always)
         for text in self.if_room:
             if name + _width([*shown, text]) > room:

@@ -63,7 +63,7 @@ def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
     for group in ("live", "prior", "loops", "links", "trajectory", "map", "disparity"):
         shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
     bad = summary.get("disparity", {}).get("bad", {})
-    shown |= {f"disparity.bad {float(limit):g}": share for limit, share in bad.items()}
+    shown |= {f"disparity.bad {float(limit):g}": ratio for limit, ratio in bad.items()}
     latency_ms = summary.get("live", {}).get("latency_ms", {})
     shown |= {f"live.latency_ms.{key}": value for key, value in latency_ms.items()}
     for part in ("voxels", "grid"):

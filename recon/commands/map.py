@@ -142,7 +142,7 @@ def run_map(
             given = options.known_poses is not None
             true = found.true_path(source, config.rectification)
             errors = compare_with_truth(source, mapped, made.grid, true, poses_given=given)
-        drift = expected_drift(mapped.trajectory, mapped.health, mapped.camera, rig.length_share)
+        drift = expected_drift(mapped.trajectory, mapped.health, mapped.camera, rig.length_ratio)
         said = [*rig.warnings(findings), *_next_drive(source, config, rig)]
         doubts = [*said, *_warnings(source, mapped, drift)]
         breaks = break_warnings(mapped)
@@ -246,7 +246,7 @@ def look_first(
         if rig.rigidity is not None and not rig.rigidity.frames:
             check_related(look, config)
         if measured is not None and source.stereo:
-            seen = see_baseline(rig.applied(look.source), config, measured, rig.length_share)
+            seen = see_baseline(rig.applied(look.source), config, measured, rig.length_ratio)
             rig = rig if seen is None else rig.with_baseline(seen, config.rig)
         if rig.refined:
             write_recon_calibration(run.path(RIG_FILE), rig.calibration)

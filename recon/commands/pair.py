@@ -256,19 +256,19 @@ def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[s
 
 
 def _disparity_figures(disparity: Disparity) -> dict[str, Any]:
-    """Return size, share of pixels for each reason, and median of a disparity, ready for JSON.
+    """Return size, fraction of pixels for each reason, and median of a disparity, ready for JSON.
 
     What was measured and what was inferred are counted apart; the median is of the former.
     ``filled_percent`` is what ``inferred_percent`` was called.
     """
     found = disparity.values[disparity.measured]
-    shares, inferred = disparity.reason_shares, 100.0 * float(disparity.inferred.mean())
+    ratios, inferred = disparity.reason_ratios, 100.0 * float(disparity.inferred.mean())
     return {
         "width_px": disparity.values.shape[1],
         "height_px": disparity.values.shape[0],
         "valid_percent": 100.0 * float(disparity.measured.mean()),
         **dict.fromkeys(("inferred_percent", "filled_percent"), inferred),
-        "reasons_percent": {r.name.lower(): 100.0 * shares.get(r, 0.0) for r in Reason},
+        "reasons_percent": {r.name.lower(): 100.0 * ratios.get(r, 0.0) for r in Reason},
         "disparity_median_px": float(np.median(found)) if len(found) else None,
     }
 

@@ -18,12 +18,12 @@ _STATUS: Final = Path("/proc/self/status")
 _PEAK: Final = re.compile(r"^VmHWM:\s+(\d+) kB$", re.MULTILINE)
 _UNITS_MB: Final = {"": 1, "M": 1, "MB": 1, "G": 1000, "GB": 1000}
 _SIZE: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", re.ASCII)
-#: Shares of the limit for an open submap, the cells of one tile, and what was read from the map.
+#: Fractions of the limit for an open submap, the cells of one tile, and what was read from the map.
 #: Sums grow by doubling and are copied when closed, so each briefly costs several times its size;
 #: most of the limit is left to the libraries, the images and the matcher.
-_SUBMAP_SHARE: Final = 1 / 40
-_TILE_SHARE: Final = 1 / 24
-_CACHE_SHARE: Final = 1 / 10
+_SUBMAP_RATIO: Final = 1 / 40
+_TILE_RATIO: Final = 1 / 24
+_CACHE_RATIO: Final = 1 / 10
 _CACHE_BYTES: Final = 100_000_000
 
 
@@ -58,17 +58,17 @@ class MemorySettings(Settings):
     @property
     def submap_bytes(self) -> int | None:
         """Size at which a submap is closed; None = closed by the path alone."""
-        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _SUBMAP_SHARE)
+        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _SUBMAP_RATIO)
 
     @property
     def tile_bytes(self) -> int | None:
         """Largest size of a tile's cells before they are merged; None = unlimited."""
-        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _TILE_SHARE)
+        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _TILE_RATIO)
 
     @property
     def cache_bytes(self) -> int:
         """Most that is kept in memory of what was read from a map."""
-        return _CACHE_BYTES if self.limit_mb is None else int(1e6 * self.limit_mb * _CACHE_SHARE)
+        return _CACHE_BYTES if self.limit_mb is None else int(1e6 * self.limit_mb * _CACHE_RATIO)
 
     def check(self, where: str) -> None:
         """Stop a run that exceeds the limit; else return what is free, for what comes next."""

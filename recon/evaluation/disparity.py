@@ -25,7 +25,7 @@ KINDS: Final[tuple[Kind, ...]] = ("measured", "inferred")
 WRONG_PX: Final = 3.0  # errors above say that another surface was found
 _QUANTILES: Final = (50, 90, 95, 99)
 _D1_PX, _D1_SHARE = 3.0, 0.05
-_DEPTH_SHARE: Final = 0.05
+_DEPTH_RATIO: Final = 0.05
 
 
 def evaluate_disparity(
@@ -39,8 +39,8 @@ def evaluate_disparity(
 ) -> DisparityMetrics:
     """Compare a disparity map with the truth, over the pixels whose truth is known.
 
-    ``bad[t]`` is the share of all compared pixels with an error above ``t``; pixels without a
-    value count as invalid and not as bad, so ``bad + invalid`` is the share of all failures.
+    ``bad[t]`` is the fraction of all compared pixels with an error above ``t``; pixels without a
+    value count as invalid and not as bad, so ``bad + invalid`` is the fraction of all failures.
 
     Args:
         estimate: A disparity, or its values: (H, W), pixels, not finite = none.
@@ -108,7 +108,7 @@ def evaluate_depth(
         median_m=_quantile(error_m, 50),
         rms_m=_mean(finite**2) ** 0.5,
         median_percent=100 * _quantile(error_m / true_m, 50),
-        over_5_percent=100 * _mean((error_m > _DEPTH_SHARE * true_m).astype(np.float64)),
+        over_5_percent=100 * _mean((error_m > _DEPTH_RATIO * true_m).astype(np.float64)),
         infinite=100 * _mean(np.isinf(error_m).astype(np.float64)),
     )
 
@@ -170,10 +170,10 @@ _STEPS: Final = 100  # points of a sparsification curve
 
 
 class Reliability(NamedTuple):
-    """Reliability diagram: share of correct pixels for each level of confidence."""
+    """Reliability diagram: fraction of correct pixels for each level of confidence."""
 
     confidence: Float64  # (B,), mean confidence in the bin; NaN = empty bin
-    right: Float64  # (B,), share of correct pixels in the bin; NaN = empty bin
+    right: Float64  # (B,), fraction of correct pixels in the bin; NaN = empty bin
     pixels: Float64  # (B,), number of pixels in the bin
 
     @property
@@ -184,10 +184,10 @@ class Reliability(NamedTuple):
 
 
 class Sparsification(NamedTuple):
-    """Sparsification curve: share of wrong pixels left as the least confident ones are removed."""
+    """Sparsification curve: fraction of wrong pixels left as the least confident ones are removed."""
 
-    removed: Float64  # (N,), share of removed pixels, from 0 to below 1
-    wrong: Float64  # (N,), share of wrong pixels among the rest, if removed by confidence
+    removed: Float64  # (N,), fraction of removed pixels, from 0 to below 1
+    wrong: Float64  # (N,), fraction of wrong pixels among the rest, if removed by confidence
     best: Float64  # (N,), the same if the wrong pixels are removed first: the optimum
 
     @property
@@ -199,7 +199,7 @@ class Sparsification(NamedTuple):
 def measure_reliability(
     estimate: Disparity, truth: DisparityTruth, limit_px: float = 1.0
 ) -> Reliability:
-    """Compare confidence with the share of pixels, occluded ones too, that are within the limit.
+    """Compare confidence with the fraction of pixels, occluded ones too, that are within the limit.
 
     Ref: C. Guo et al., "On calibration of modern neural networks", ICML 2017, section 2.
     """
@@ -208,8 +208,8 @@ def measure_reliability(
     place = np.minimum((confidence.astype(np.float64) * _BINS).astype(np.int64), _BINS - 1)
     pixels = np.bincount(place, minlength=_BINS).astype(np.float64)
     with np.errstate(invalid="ignore"):
-        mean, share = (np.bincount(place, x, _BINS) / pixels for x in (confidence, right))
-    return Reliability(mean, share, pixels)
+        mean, ratio = (np.bincount(place, x, _BINS) / pixels for x in (confidence, right))
+    return Reliability(mean, ratio, pixels)
 
 
 def measure_sparsification(
@@ -231,8 +231,8 @@ def measure_sparsification(
     return Sparsification(removed, by_confidence, best)
 
 
-def share_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float = 1.0) -> float:
-    """Return the share of the pixels, in [0, 1], whose error is within some standard deviations."""
+def ratio_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float = 1.0) -> float:
+    """Return the fraction of the pixels, in [0, 1], whose error is within some standard deviations."""
     both, error_px = _pixels(estimate, truth)
     return float(np.mean(error_px < sigmas * estimate.sigma_px[both]))
 

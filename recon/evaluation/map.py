@@ -120,7 +120,7 @@ def icp(
     """Align points (N, 3) to a reference cloud by robust point-to-plane ICP, from where they are.
 
     ``reaches_m``: largest distance of partners in each pass, decreasing. Returns
-    ``T_reference_points``, and the share of the points that have a partner in the last pass.
+    ``T_reference_points``, and the fraction of the points that have a partner in the last pass.
 
     Ref: Chen & Medioni, "Object modelling by registration of multiple range images", 1992;
     robust weights: Babin et al., "Analysis of robust functions for registration algorithms", 2019.

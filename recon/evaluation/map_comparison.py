@@ -156,18 +156,18 @@ def place_by_icp(
                 raise
         else:
             found.append((fitted, {**how, "reference_frame": frame, **moved}))
-    return max(found, key=lambda each: each[1]["icp_share"])
+    return max(found, key=lambda each: each[1]["icp_ratio"])
 
 
 def _fit_cloud(
     mapped: MappedCloud, reference: PointCloud, reach_m: float
 ) -> tuple[MappedCloud, dict[str, Any]]:
     reference = replace(reference, frame=mapped.cloud.frame)
-    T, share = register_cloud(mapped.cloud, reference, reach_m)
+    T, ratio = register_cloud(mapped.cloud, reference, reach_m)
     # Measured at the centre of the map: a rotation about a far origin would look like a shift.
     middle = np.eye(4)
     middle[:3, 3] = mapped.cloud.xyz.mean(axis=0, dtype=np.float64)
-    figures = {**_size("icp", invert(middle) @ T @ middle), "icp_share": share}
+    figures = {**_size("icp", invert(middle) @ T @ middle), "icp_ratio": ratio}
     cloud = transform_cloud(mapped.cloud, T, frame=mapped.cloud.frame)
     return replace(mapped, cloud=cloud, path=_moved(mapped.path, T)), figures
 

@@ -84,8 +84,8 @@ def _compare_voxels(
 ) -> VoxelMetrics:
     wanted = truth.keys[truth.frames >= truth.least_frames]
     return VoxelMetrics(
-        precision=_share(_near(counted, truth.keys, tolerance)),
-        recall=_share(_near(wanted, occupied, tolerance)),
+        precision=_ratio(_near(counted, truth.keys, tolerance)),
+        recall=_ratio(_near(wanted, occupied, tolerance)),
         voxels=len(counted),
         true_voxels=len(wanted),
     )
@@ -119,8 +119,8 @@ def _compare_grids(cells: NDArray[np.int8], truth: OccupancyTruth, tolerance: in
     return GridMetrics(
         iou_occupied=_iou(cells == OCCUPIED, true == OCCUPIED, seen, tolerance),
         iou_free=_iou(cells == FREE, true == FREE, seen, tolerance),
-        occupied_called_free=_share(cells[occupied] == FREE),
-        unknown=_share(cells[seen] == UNKNOWN),
+        occupied_called_free=_ratio(cells[occupied] == FREE),
+        unknown=_ratio(cells[seen] == UNKNOWN),
         cells=int(seen.sum()),
         true_occupied=int(occupied.sum()),
     )
@@ -139,6 +139,6 @@ def _grown(cells: Bool, tolerance: int) -> Bool:
     return np.asarray(cv2.dilate(cells.astype(np.uint8), kernel) > 0)
 
 
-def _share(which: Bool) -> float:
-    """Return the share of True values; NaN if empty."""
+def _ratio(which: Bool) -> float:
+    """Return the fraction of True values; NaN if empty."""
     return float(which.mean()) if which.size else float("nan")

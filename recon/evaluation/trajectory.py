@@ -23,7 +23,7 @@ from recon.places.places import drift_at_end, fit_to_path
 
 # A camera that moved less stood still, be it an endoscope: errors relative to it say nothing.
 MIN_PATH_M: Final = 0.01
-_STRAIGHT: Final = 0.05  # largest width of a straight path, as share of its length (both rms)
+_STRAIGHT: Final = 0.05  # largest width of a straight path, as fraction of its length (both rms)
 # The positions fix the roll to about their error over the width of the path, in radians.
 _NONSENSE: Final = 0.5  # of the length of a motion, by which it is off: of one turned by 29 degrees
 _FIXED_RAD: Final = float(np.radians(0.5))
@@ -206,17 +206,17 @@ def _check_orders(
         wrong_m, _ = motion_errors(motion.move(ours), true, segments.first, segments.last)
         return float(np.mean(wrong_m / segments.length_m))
 
-    share = off(estimate, truth)
-    if share < _NONSENSE:
+    ratio = off(estimate, truth)
+    if ratio < _NONSENSE:
         return
     others = {
         "estimate": off(reordered(estimate), truth),
         "truth": off(estimate, reordered(truth)),
     }
     name, least = min(others.items(), key=lambda item: item[1])
-    if least < 0.1 * share:
+    if least < 0.1 * ratio:
         what = f"the quaternions of the {name} are not in the order of TUM, qx qy qz qw"
-        got = f"t_rel {share:.0%}, and {least:.2%} as qw qx qy qz"
+        got = f"t_rel {ratio:.0%}, and {least:.2%} as qw qx qy qz"
         raise EvaluationError(what, got=got, hint=ORDER_HINT)
 
 
@@ -345,7 +345,7 @@ def _units_apart(estimate: Trajectory, truth: Trajectory) -> str:
     return f"timestamps of the {names[0]} are {unit}, where those of the {names[1]} are seconds"
 
 
-# A turn changes evenly from frame to frame if it does so less than this share of the median.
+# A turn changes evenly from frame to frame if it does so less than this fraction of the median.
 _EVEN: Final = 0.02
 _LEAST_CHANGES: Final = 5  # fewer even changes in a row may be chance
 # Where turns change less than this everywhere, the digits of the file decide: KITTI has six.

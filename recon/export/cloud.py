@@ -20,7 +20,7 @@ from recon.map.tiles import Tiles
 
 SAMPLE_POINTS: Final = 300_000  # points of the fused cloud that are kept for display
 _GROWTH: Final = 1.25
-_MUCH: Final = 0.02  # share of the points left out without a word; a busy street has less
+_MUCH: Final = 0.02  # fraction of the points left out without a word; a busy street has less
 
 
 def cloud_product(order: Order, path: Path) -> Made:
@@ -83,10 +83,10 @@ def _doubts(tiles: Tiles, points: int, removed: int) -> list[str]:
     if tiles.config.fusion.remove_moving and tiles.observations is None:
         what = "no rays were kept, so what moved stays in the cloud"
         return [f"{what}; map with --set occupancy.keep_rays=true to leave it out"]
-    share = removed / max(points + removed, 1)
-    if share <= _MUCH:
+    ratio = removed / max(points + removed, 1)
+    if ratio <= _MUCH:
         return []
-    what = f"{100 * share:.1f} % of the points are taken for what moved and left out"
+    what = f"{100 * ratio:.1f} % of the points are taken for what moved and left out"
     return [f"{what}: look at map/removed.ply; --set fusion.remove_moving=false keeps them"]
 
 

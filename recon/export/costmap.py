@@ -85,10 +85,10 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
     settings = band.model_copy(update={"max_height_m": robot.clearance_m})
     grid, _, warnings = Flattening(placed, settings, finish).grid()
     if 2 * steep > seen:
-        share, limit = f"{100 * steep / seen:.0f} %", f"{robot.max_slope_percent:g}"
+        ratio, limit = f"{100 * steep / seen:.0f} %", f"{robot.max_slope_percent:g}"
         level = "is the map level (z up)? An inertial unit levels it"
         text = (
-            f"{share} of the ground seen is steeper than robot.max_slope_percent={limit}: {level}"
+            f"{ratio} of the ground seen is steeper than robot.max_slope_percent={limit}: {level}"
         )
         warnings = (*warnings, text)
     return grid, warnings

@@ -37,8 +37,8 @@ from recon.map.sessions.placed import PlacedMap
 
 # A city of 6 by 6 km at 0.2 m; each is a byte of memory and of the file.
 _MOST_CELLS: Final = 1_000_000_000
-# Share of the ground that must lie below the height band: else parts of it become obstacles.
-GROUND_SHARE: Final = 0.95
+# Fraction of the ground that must lie below the height band: else parts of it become obstacles.
+GROUND_RATIO: Final = 0.95
 # Least distance, on a road, from the path to the edge of the grid: a footprint must fit in at the
 # start.
 _MARGIN_M: Final = 5.0
@@ -142,7 +142,7 @@ class Flattening:
         depths_m = np.concatenate(self._ground_depths)
         if len(depths_m):
             # What is seen as thin as can be still lies up to half a voxel off its centre.
-            thick_m = max(cell_m / 2, float(np.quantile(depths_m, GROUND_SHARE)))
+            thick_m = max(cell_m / 2, float(np.quantile(depths_m, GROUND_RATIO)))
             if settings.min_height_m < thick_m:
                 enough_m = math.ceil(20 * thick_m) / 20
                 yield (

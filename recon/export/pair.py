@@ -36,7 +36,7 @@ def mesh_frame(
     """Mesh the cloud of a frame as its camera saw it.
 
     Returns:
-        The surface in camera axes, or None; the share of the measured points that lie on it;
+        The surface in camera axes, or None; the fraction of the measured points that lie on it;
         warnings.
     """
     try:
@@ -65,7 +65,7 @@ def _surface(
 
 
 def _coverage(mesh: TriangleMesh, cloud: PointCloud, settings: MeshSettings) -> float:
-    """Return the share of the measured points that lie on a mesh; of all, if none is measured.
+    """Return the fraction of the measured points that lie on a mesh; of all, if none is measured.
 
     Of a closed body, on its front, whose vertices come first.
     """
@@ -146,7 +146,7 @@ def mesh_cloud(
         mesh = _surface(cloud, camera, settings, _photo_of(run, camera))
         covered = {"mesh_coverage": _coverage(mesh, cloud, settings)}
     sizes = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    warnings = [line for share in covered.values() for line in check_coverage(share)]
+    warnings = [line for ratio in covered.values() for line in check_coverage(ratio)]
     return mesh, {**sizes, **covered, "warnings": warnings}
 
 

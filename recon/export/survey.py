@@ -10,7 +10,7 @@ import numpy as np
 
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool
-from recon.export.occupancy import GROUND_SHARE, grounds
+from recon.export.occupancy import GROUND_RATIO, grounds
 from recon.export.product import Made, Order
 from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
@@ -60,7 +60,7 @@ def ground_points(cloud: PointCloud, surface: GroundSurface) -> Bool:
     """
     above_m = cloud.xyz[:, 2] - surface.height_at(cloud.xyz[:, :2])
     below_m = -above_m[(above_m <= 0) & (above_m >= -WINDOW_M)]
-    thick_m = float(np.quantile(below_m, GROUND_SHARE)) if len(below_m) else 0.0
+    thick_m = float(np.quantile(below_m, GROUND_RATIO)) if len(below_m) else 0.0
     on = np.abs(above_m) <= thick_m  # not where the surface is unknown
     if cloud.normals is not None:
         on &= cloud.normals[:, 2] >= math.cos(math.radians(MAX_TILT_DEG))

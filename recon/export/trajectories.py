@@ -66,7 +66,7 @@ def _edge(loop: Loop) -> dict[str, Any]:
         "first": loop.first,
         "last": loop.last,
         "inliers": loop.inliers,
-        "dense_share": round(loop.dense_share, 4),
+        "dense_ratio": round(loop.dense_ratio, 4),
         "T_first_last": loop.T_first_last.tolist(),
     }
 

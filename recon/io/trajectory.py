@@ -264,8 +264,8 @@ def _wander_rad(path: Trajectory) -> float:
     steps_m = np.diff(path.positions_m, axis=0)
     turned_m = np.einsum("nji,nj->ni", poses[:-1, :3, :3], steps_m)
     length_m = float(np.linalg.norm(steps_m, axis=1).sum())
-    share = float(np.linalg.norm(turned_m.sum(axis=0))) / length_m if length_m > 0 else 1.0
-    return float(np.sqrt(2.0 * max(0.0, 1.0 - share)))  # 1 - cos, for small angles
+    ratio = float(np.linalg.norm(turned_m.sum(axis=0))) / length_m if length_m > 0 else 1.0
+    return float(np.sqrt(2.0 * max(0.0, 1.0 - ratio)))  # 1 - cos, for small angles
 
 
 def check_positions(xyz_m: Float64, lines: Sequence[int], path: StrPath) -> None:

@@ -24,7 +24,9 @@ Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
 _FATAL: Final = {"unreadable", "black", "frozen", "swapped", "lag", "nonrigid", "size", "baseline"}
 _SIDES = ("left", "right")
-_SWAPPED_SHARE: Final = 0.8  # share of negative disparities from which the cameras count as swapped
+_SWAPPED_RATIO: Final = (
+    0.8  # fraction of negative disparities from which the cameras count as swapped
+)
 _EPIPOLAR_PX: Final = 0.75  # rms epipolar error above which it is reported
 _BAD_EPIPOLAR_PX: Final = (
     1.5  # rms epipolar error above which it is fatal, unless recon map corrects it
@@ -32,9 +34,9 @@ _BAD_EPIPOLAR_PX: Final = (
 _GAIN: Final = 1.2  # brightness ratio above which a finding is reported
 _SHARPNESS_RATIO: Final = 0.65  # one camera counts as blurred below, relative to the other
 _SHARPNESS: Final = 0.14  # both cameras count as blurred below this sharpness
-_REPEATED_SHARE: Final = 0.02  # share of repeated frames that is still accepted
+_REPEATED_RATIO: Final = 0.02  # fraction of repeated frames that is still accepted
 _FROZEN_FRAMES: Final = 3  # repeats in a row from which one camera counts as frozen
-_NEAR_SHARE: Final = 0.02  # share of features beyond the disparity range that is accepted
+_NEAR_RATIO: Final = 0.02  # fraction of features beyond the disparity range that is accepted
 _FAR_PX: Final = 1.5  # a scene with a smaller median disparity is too far for the baseline
 _MAX_SPEED_M_PER_S: Final = 70.0  # a higher apparent speed means that the baseline is wrong
 _TEXTS: Final = {
@@ -146,7 +148,7 @@ def _blank_sides(sample: Sample) -> list[int]:
 
 def _of_series(sample: Sample, gaps: Gaps) -> Found:
     repeats, blank = sample.repeats, _blank_sides(sample)
-    if repeats.steps and repeats.both > _REPEATED_SHARE * repeats.steps:
+    if repeats.steps and repeats.both > _REPEATED_RATIO * repeats.steps:
         yield "duplicates", {"repeated": repeats.both, "steps": counted(repeats.steps, "frame")}
     for side, run in enumerate(repeats.frozen):
         # A camera with uniform images would count as frozen, too.
@@ -158,10 +160,10 @@ def _of_series(sample: Sample, gaps: Gaps) -> Found:
 
 def _of_geometry(look: Look) -> Found:
     geometry, skew = look.geometry, look.skew
-    swapped, offset = geometry.swapped_share, geometry.offset
+    swapped, offset = geometry.swapped_ratio, geometry.offset
     if look.shifted:
         yield "lag shifted", {"fatal": False, "paired": look.first[0]}
-    if swapped >= _SWAPPED_SHARE:
+    if swapped >= _SWAPPED_RATIO:
         yield "swapped", {"percent": 100 * swapped}
     if offset:
         shift = look.source.shift_of(offset)
@@ -211,7 +213,7 @@ def _of_range(disparity_px: Float64, reach_px: int | None, camera: RectifiedCame
     # A matcher's disparity is in image columns, without doffs.
     columns_px = disparity_px - camera.doffs_px
     near = float(np.mean(columns_px > reach_px)) if reach_px else 0.0
-    if reach_px and near > _NEAR_SHARE:
+    if reach_px and near > _NEAR_RATIO:
         reach = {"reach_px": reach_px, "reach": metres(scale / (reach_px + camera.doffs_px))}
         most = int(np.ceil(np.quantile(columns_px, 0.98) / 16) * 16)
         yield "near", {"percent": 100 * near, **reach, "most": most}

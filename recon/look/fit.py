@@ -34,7 +34,7 @@ from recon.odometry.pose import (
 
 _ROUNDS: Final = 32  # times at most that all windows are adjusted, without the fault as known then
 _LAST_STEP: Final = 1.0  # length of a step, in standard deviations, after which there is no other
-_ROUNDING: Final = 1e-9  # share of the best known direction below which one is not known at all
+_ROUNDING: Final = 1e-9  # fraction of the best known direction below which one is not known at all
 _RECALLED: Final = 4  # last rounds that the next one learns from
 _FIRST: Final = 4  # every so many-th track is fitted first, so that few rounds take all of them
 _QUARTERS: Final = 4  # parts of the features of a window that lie alike
@@ -54,7 +54,7 @@ class FittedFault:
 
     values: Float64
     covariance: Float64  # (P, P), mean squares of their errors, by shrinking as well
-    lengthening: Float64  # (P,), by what share the path becomes longer with each
+    lengthening: Float64  # (P,), by what ratio the path becomes longer with each
     scatter: float  # how much more windows contradict each other than their features say, 1 or more
     windows: int
     time_offset: float = 0.0  # frames by which right images are taken later than left ones
@@ -232,9 +232,9 @@ def _not_contradicted(known: Float64, H: Float64, g: Float64) -> Float64:
     squared = (V.T @ (root.T @ g)) ** 2  # of a rig that has not changed, D² + D
     usual = np.maximum(D, 0.0) ** 2
     most = np.maximum(squared - D, usual)
-    share = np.divide(usual, most, where=most > 0.0, out=np.ones_like(D))
+    ratio = np.divide(usual, most, where=most > 0.0, out=np.ones_like(D))
     axes = np.linalg.solve(root.T, V)
-    return np.asarray((axes * share) @ axes.T)
+    return np.asarray((axes * ratio) @ axes.T)
 
 
 def _accelerated(tried: Sequence[Float64], steps: Sequence[Float64], metric: Float64) -> Float64:
@@ -247,8 +247,8 @@ def _accelerated(tried: Sequence[Float64], steps: Sequence[Float64], metric: Flo
     if len(tried) == 1 or np.diff(np.linalg.norm(whiten @ np.transpose(steps), axis=0))[-1] > 0.0:
         return np.asarray(x + step)  # nothing to learn from, or it led astray
     by_step = np.diff(steps, axis=0).T
-    share = np.linalg.lstsq(whiten @ by_step, whiten @ step, rcond=None)[0]
-    return np.asarray(x + step - (np.diff(tried, axis=0).T + by_step) @ share)
+    ratio = np.linalg.lstsq(whiten @ by_step, whiten @ step, rcond=None)[0]
+    return np.asarray(x + step - (np.diff(tried, axis=0).T + by_step) @ ratio)
 
 
 def _scatter(known: Float64, total: Float64, g: Float64) -> float:
@@ -282,7 +282,7 @@ def _in_time(
 
 
 def _lengthening(found: Sequence[tuple[TrackWindow, _System]]) -> Float64:
-    """Return by what share the path of all windows becomes longer with each parameter (P,)."""
+    """Return by what ratio the path of all windows becomes longer with each parameter (P,)."""
     ends = [window.T_world_camera[[0, -1]] for window, _ in found]
     # In the axes of the last frame.
     path_m = np.stack([last[:3, :3].T @ (last[:3, 3] - first[:3, 3]) for first, last in ends])
@@ -329,9 +329,9 @@ def _system(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _Sy
     folded = cross @ np.linalg.inv(normal.H_point + bundle.RIDGE * np.eye(3))
     S -= np.tensordot(folded, cross, axes=((0, 2), (0, 2)))
     g -= np.tensordot(folded, normal.g_point, axes=((0, 2), (0, 1)))
-    share = np.linalg.solve(S[:size, :size] + bundle.RIDGE * np.eye(size), S[:size, size:]).T
-    H, g = S[size:, size:] - share @ S[:size, size:], g[size:] - share @ g[:size]
-    return _System(H, g, -share[:, -6:-3])
+    ratio = np.linalg.solve(S[:size, :size] + bundle.RIDGE * np.eye(size), S[:size, size:]).T
+    H, g = S[size:, size:] - ratio @ S[:size, size:], g[size:] - ratio @ g[:size]
+    return _System(H, g, -ratio[:, -6:-3])
 
 
 class _Shared(NamedTuple):

@@ -34,7 +34,7 @@ class Geometry:
     matched: int  # number of features matched in pairs as recorded
     alignment: EpipolarAlignment | None  # epipolar errors; None if there are too few features
     disparity_px: Float64  # (M,), of the features whose rows agree; 0 is at infinity
-    swapped_share: float  # of near features, farther right in the right image; NaN = too few
+    swapped_ratio: float  # of near features, farther right in the right image; NaN = too few
     out_of_step: bool  # whether images of other moments fit better
     offset: int  # delay of the right camera in whole frames
     # its delay in parts of a frame, and the standard error; None if unknown, or whole frames
@@ -58,7 +58,7 @@ def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
         matched=matched,
         alignment=alignment,
         disparity_px=_disparities(features, alignment, camera),
-        swapped_share=inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share,
+        swapped_ratio=inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_ratio,
         out_of_step=bool(offset) or _best_fit(by_offset)[1] > _OFFSET_FACTOR,
         offset=offset,
         skew=skew,

@@ -27,7 +27,7 @@ from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor, StereoSettings
 
 _BASELINE_SIGMA: Final = 0.02
-"""Share of a baseline, standard deviation beforehand: of one that was measured with a ruler."""
+"""Fraction of a baseline, standard deviation beforehand: of one that was measured with a ruler."""
 
 _SETTING: Final = "source.length"
 
@@ -37,16 +37,16 @@ KnownLength = tuple[int, int, float]
 
 @dataclass(frozen=True)
 class SeenBaseline:
-    """By what share the cameras are farther apart than given, as measured lengths show it."""
+    """By what ratio the cameras are farther apart than given, as measured lengths show it."""
 
-    share: float  # what is to be corrected: 0 where chance explains what was measured
+    ratio: float  # what is to be corrected: 0 where chance explains what was measured
     sigma: float  # standard deviation of what is left
-    longer: float  # by what share the lengths are longer than the images alone say
+    longer: float  # by what ratio the lengths are longer than the images alone say
     longer_sigma: float
 
     def applied(self, rig: Rig) -> Rig:
         """Return a rig with the baseline as it was seen."""
-        wider = 1.0 + self.share
+        wider = 1.0 + self.ratio
         if isinstance(rig, RectifiedCamera):
             return replace(rig, baseline_m=wider * rig.baseline_m)
         T = rig.T_right_left.copy()
@@ -56,14 +56,14 @@ class SeenBaseline:
     def describe(self, *, used: bool) -> str:
         """Return in words what was measured, and what became of it."""
         off = f"{100.0 * self.longer:+.2f} ± {196.0 * self.longer_sigma:.2f} %"
-        use = f"used is one {100.0 * self.share:+.2f} %" if used else "used is that given"
+        use = f"used is one {100.0 * self.ratio:+.2f} %" if used else "used is that given"
         return f"measured lengths are {off} off those by the baseline as calibrated; {use}"
 
     def figures(self) -> dict[str, float]:
         """Return the same for ``summary.json``, in per cent of the baseline."""
-        shares = {"percent": self.share, "sigma_percent": self.sigma}
-        shares |= {"measured_percent": self.longer, "measured_sigma_percent": self.longer_sigma}
-        return {name: 100.0 * share for name, share in shares.items()}
+        ratios = {"percent": self.ratio, "sigma_percent": self.sigma}
+        ratios |= {"measured_percent": self.longer, "measured_sigma_percent": self.longer_sigma}
+        return {name: 100.0 * ratio for name, ratio in ratios.items()}
 
 
 def check_length(source: StereoSource, known: KnownLength) -> None:
@@ -82,7 +82,7 @@ def see_baseline(
     source: StereoSource,
     config: StereoSettings,
     measured: MotionPrior | KnownLength,
-    rig_share: float | None = None,
+    rig_ratio: float | None = None,
 ) -> SeenBaseline | None:
     """Compare lengths that were measured along a drive with those that its images show.
 
@@ -94,21 +94,21 @@ def see_baseline(
         source: The drive, with its rig refined.
         config: How pairs are matched.
         measured: Path by other sensors, or one length.
-        rig_share: As for `expected_drift`, which says how certain lengths by the images are.
+        rig_ratio: As for `expected_drift`, which says how certain lengths by the images are.
 
     Raises:
         RegistrationError: Odometry is lost between two frames, or they are at one place.
     """
     if isinstance(measured, MotionPrior):
-        common = measured.settings.sigma_share
+        common = measured.settings.sigma_ratio
         if source.live or common >= _BASELINE_SIGMA:
             return None
         parts = tracked_parts(len(source))
-        segments = [_seen(source, config, start, stop, rig_share) for start, stop in parts]
+        segments = [_seen(source, config, start, stop, rig_ratio) for start, stop in parts]
         beside = [None if one is None else _beside(one, measured) for one in segments]
         lengths = [length for length in beside if length is not None]
     else:
-        common, lengths = 0.0, [_between(source, config, measured, rig_share)]
+        common, lengths = 0.0, [_between(source, config, measured, rig_ratio)]
     return _compared(np.array(lengths), common) if lengths else None
 
 
@@ -141,7 +141,7 @@ class _Seen(NamedTuple):
 
 
 def _seen(
-    source: StereoSource, config: StereoSettings, start: int, stop: int, rig_share: float | None
+    source: StereoSource, config: StereoSettings, start: int, stop: int, rig_ratio: float | None
 ) -> _Seen | None:
     """Return what visual odometry shows of a segment; None = it is lost there, or nothing moves."""
     odometry, reconstructor = VisualOdometry(), FrameReconstructor(source.calibration, config)
@@ -153,7 +153,7 @@ def _seen(
             times_s.append(pair.timestamp_s)
     path = Trajectory(np.stack([one.T_world_camera for one in found]), np.array(times_s))
     health = [one.health for one in found]
-    drift = expected_drift(path, health, reconstructor.camera, rig_share)
+    drift = expected_drift(path, health, reconstructor.camera, rig_ratio)
     if drift is None or not trusted_poses(health).all():
         return None
     length_m = float(np.linalg.norm(path.positions_m[-1] - path.positions_m[0]))
@@ -166,11 +166,11 @@ def _seen(
 
 
 def _between(
-    source: StereoSource, config: StereoSettings, known: KnownLength, rig_share: float | None
+    source: StereoSource, config: StereoSettings, known: KnownLength, rig_ratio: float | None
 ) -> Float64:
     """Return what `_compared` takes of the distance between two frames."""
     first, last, length_m = known
-    seen = _seen(source, config, first, last + 1, rig_share)
+    seen = _seen(source, config, first, last + 1, rig_ratio)
     if seen is None or seen.length_m <= 2.0 * seen.sigma_m:
         why = "odometry is lost between them" if seen is None else "they are at one place"
         what = "the length between two frames shows no baseline"

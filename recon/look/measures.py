@@ -27,7 +27,7 @@ _MIN_DISPARITY_PX: Final = 2.0
 _AGREE_PX: Final = 2.0
 MIN_FEATURES: Final = 60  # minimum number of features, in all, to judge geometry
 LARGEST_SKEW: Final = 0.75  # a larger skew, in frames, is closer to an offset of one frame
-_IN_STEP: Final = 0.8  # share of features that agree on one rotation, of images of one moment
+_IN_STEP: Final = 0.8  # fraction of features that agree on one rotation, of images of one moment
 _MIN_FLOW_PX: Final = 1.0  # rows per frame by which features must move to reveal a time skew
 
 
@@ -50,7 +50,7 @@ def _medians(image: UInt8, uv: Float32) -> Float64:
 
 
 def measure_sharpness(image: UInt8) -> float:
-    """Return the share of the finest detail in all detail of a grey image, in [0, 1].
+    """Return the fraction of the finest detail in all detail of a grey image, in [0, 1].
 
     Blur reduces the Laplacian at full size, but not at a quarter of it.
     """

@@ -109,7 +109,7 @@ class RefinedRig:
         return () if known is None or known.kept else (known.describe(),)
 
     @property
-    def length_share(self) -> float | None:
+    def length_ratio(self) -> float | None:
         """Standard deviation of the length of the path that is left to the rig used, as a share.
 
         Without the baseline, unless lengths that were measured changed it; None if nothing was.
@@ -120,7 +120,7 @@ class RefinedRig:
         if np.isnan(own):  # fitted by an earlier version
             own = float(np.sqrt(by @ self.fitted.covariance @ by))
         kept = 0.0 if self.refined else float(by @ self.fitted.values)
-        wider = self.baseline.sigma if self.baseline is not None and self.baseline.share else 0.0
+        wider = self.baseline.sigma if self.baseline is not None and self.baseline.ratio else 0.0
         return float(np.sqrt(own**2 + kept**2 + wider**2))
 
     def applied(self, source: StereoSource) -> StereoSource:
@@ -132,7 +132,7 @@ class RefinedRig:
 
     def with_baseline(self, seen: SeenBaseline, settings: RigSettings) -> RefinedRig:
         """Return the rig with the baseline that lengths show; if it is to be kept, it says so."""
-        use = settings.refine and seen.share != 0.0
+        use = settings.refine and seen.ratio != 0.0
         rig = seen.applied(self.calibration) if use else self.calibration
         return replace(self, calibration=rig, baseline=seen)
 
@@ -161,8 +161,8 @@ class RefinedRig:
         given_px = disparity_px + change.mean_px
         if given_px <= 0.0:
             return float("inf"), float("inf")
-        share = disparity_px / given_px
-        return 100.0 * (share - 1.0), 100.0 * share * self.sigma_px / given_px
+        ratio = disparity_px / given_px
+        return 100.0 * (ratio - 1.0), 100.0 * ratio * self.sigma_px / given_px
 
     def rms_percent(self, depth_m: float) -> float:
         """Return the depth error there, root mean square over the image; 0 if none is known.
@@ -252,7 +252,7 @@ class RefinedRig:
         lines = [late] if self.late and not any(LATER in line for line in known) else []
         if self.fitted is not None and not self.fitted.fixed:
             lines.append(MOVES)
-        if self.baseline is not None and self.baseline.share:
+        if self.baseline is not None and self.baseline.ratio:
             lines.append(self.baseline.describe(used=self.refined))
         if not self.wrong_at(DEPTHS_M[0]):
             return lines

@@ -111,7 +111,7 @@ class PairMeasures:
     contrast_dn: Sides  # standard deviations of grey levels
     brightness_dn: Sides  # mean grey levels
     shown: RectifiedPair | None = None  # the images; None where they are not kept
-    sharpness: Sides = (np.nan, np.nan)  # shares of the finest detail; NaN if unknown
+    sharpness: Sides = (np.nan, np.nan)  # fractions of the finest detail; NaN if unknown
     gains: Float64 = field(default_factory=_none)  # brightness ratios around features
     features: PairFeatures = NO_FEATURES  # matched features
     flow: Float64 = field(

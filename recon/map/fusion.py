@@ -81,7 +81,7 @@ def row_bytes(known: Collection[str]) -> int:
     return 16 + 4 * sums_in(known)
 
 
-_PRECISE: Final = 0.8  # voxels known to this share of their edge need one frame less
+_PRECISE: Final = 0.8  # voxels known to this fraction of their edge need one frame less
 _PLACED: Final = slice(0, 4)
 _MOST: Final = 1e20
 """Larger than any sum of weights, or of values by weight; sums of much larger ones overflow."""

@@ -28,9 +28,9 @@ from recon.odometry.protocol import (
 )
 
 _MAX_SIGMA_M: Final = 0.05  # largest standard deviation of a trusted motion on a road
-_MAX_SIGMA_SHARE: Final = 0.05  # share of the motion's length that is added to it
+_MAX_SIGMA_RATIO: Final = 0.05  # fraction of the motion's length that is added to it
 _MIN_TELLING: Final = 8  # with fewer usable patches the images say nothing
-MIN_SHARE: Final = 0.6  # least share of patches that must agree with a trusted motion
+MIN_RATIO: Final = 0.6  # least fraction of patches that must agree with a trusted motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class CheckedOdometry:
             return [f"the motion is known to {health.sigma_m:.2g} m only"]
         found = explain_motion(*views, T_before_now, camera)
         if found.informative >= _MIN_TELLING:
-            return _contradiction(found.share, found.informative)
+            return _contradiction(found.ratio, found.informative)
         # A visual motion has passed the test of its uncertainty; any other has no other evidence.
         if np.isfinite(health.sigma_m):
             return []
@@ -113,14 +113,14 @@ class CheckedOdometry:
 def most_sigma_m(length_m: float, scale: float) -> float:
     """Return the largest standard deviation of a trusted motion of that length."""
     # Among near things steps are long, and loops hold the path: there it may be more.
-    return min(1.0, 2.5 * scale) * _MAX_SIGMA_M + _MAX_SIGMA_SHARE * length_m
+    return min(1.0, 2.5 * scale) * _MAX_SIGMA_M + _MAX_SIGMA_RATIO * length_m
 
 
-def _contradiction(share: float, informative: int) -> list[str]:
-    if share >= MIN_SHARE:
+def _contradiction(ratio: float, informative: int) -> list[str]:
+    if ratio >= MIN_RATIO:
         return []
     patches = counted(informative, "patch", "patches")
-    return [f"only {100 * share:.0f} % of {patches} of the image moved like that"]
+    return [f"only {100 * ratio:.0f} % of {patches} of the image moved like that"]
 
 
 _LEAST_NOISE: Final = 0.5  # grey values: rounding alone leaves 0.3
@@ -139,7 +139,7 @@ class Agreement:
     """How many patches of an image a motion explains."""
 
     informative: int  # patches with texture in all directions, which can distinguish motions
-    share: float  # share of them that match where the motion takes them; NaN = there are none
+    ratio: float  # fraction of them that match where the motion takes them; NaN = there are none
 
 
 @dataclass(frozen=True, eq=False)

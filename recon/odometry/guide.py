@@ -20,7 +20,7 @@ MIN_HELD: Final = 8
 """Fewer tracks that agree on a translation give no pose. Two fix it; that six more of a hundred
 wrong ones, each with a chance of 1 %, agree with one of some hundred translations, happens once in
 a hundred times, and then they contradict the turn."""
-_MIN_HELD_SHARE: Final = 0.05  # of many tracks, more agree by chance
+_MIN_HELD_RATIO: Final = 0.05  # of many tracks, more agree by chance
 _PAIRS: Final = 300  # pairs of features whose translations are tried
 _SIGMAS: Final = 3.0
 _ROUNDS: Final = 3
@@ -66,7 +66,7 @@ class Guided:
 
     def enough_agree(self, agreeing: int, tracks: int) -> bool:
         """Whether so many of the tracks agree that a pose that has the turn counts as measured."""
-        return agreeing >= max(MIN_HELD, _MIN_HELD_SHARE * tracks)
+        return agreeing >= max(MIN_HELD, _MIN_HELD_RATIO * tracks)
 
     def locate(
         self, xyz_world: Float64, uv: Float64, camera: RectifiedCamera

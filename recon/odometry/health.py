@@ -16,7 +16,7 @@ from recon.odometry.checked import SegmentCounter
 from recon.odometry.protocol import OdometryHealth
 
 _MANY: Final = 0.1
-"""Share of frames without a trusted pose above which the whole drive is in question."""
+"""Fraction of frames without a trusted pose above which the whole drive is in question."""
 
 _NAMED: Final = 3  # segments of frames that a line names
 
@@ -91,7 +91,7 @@ RIG_DISPARITY_PX: Final = 0.1
 RIG_YAW_DEG: Final = 0.02
 """That of the angle between the cameras, which shifts all disparities, too."""
 
-RIG_BASELINE: Final = 0.002  # that of the baseline, as a share of it
+RIG_BASELINE: Final = 0.002  # that of the baseline, as a fraction of it
 _SEGMENT_M: Final = 100.0
 """Length over which the drift is stated, or the path if it is shorter: errors of the heading make
 it grow with the length."""
@@ -110,8 +110,8 @@ class ExpectedDrift:
     rests_on_m: float  # distance of the points on which the length rests
 
     @property
-    def radius_share(self) -> float:
-        """Where a position is with 95 % probability: within this share of the path up to it."""
+    def radius_ratio(self) -> float:
+        """Where a position is with 95 % probability: within this fraction of the path up to it."""
         return _SIGMAS * self.percent / 100.0
 
     def warnings(self) -> list[str]:
@@ -127,11 +127,11 @@ def expected_drift(
     path: Trajectory,
     health: Sequence[OdometryHealth],
     camera: RectifiedCamera,
-    rig_share: float | None = None,
+    rig_ratio: float | None = None,
 ) -> ExpectedDrift | None:
     """How far a path by odometry may be off; None where no motion was measured.
 
-    ``rig_share`` is the standard deviation of its length that the drive leaves to the rig, as a
+    ``rig_ratio`` is the standard deviation of its length that the drive leaves to the rig, as a
     share; None = nothing is known of the rig, it counts as calibrated well. Frames without a
     trusted pose do not count: `health_warnings` names them.
     """
@@ -143,11 +143,11 @@ def expected_drift(
     if not length_m > 0.0:
         return None
     scale_px, sigma_m, sigma_deg = figures[known].T
-    if rig_share is None:
-        rig_share = float(steps_m[known] @ _scale_share(scale_px, camera) / length_m)
-    rig = float(np.hypot(rig_share, RIG_BASELINE))
+    if rig_ratio is None:
+        rig_ratio = float(steps_m[known] @ _scale_ratio(scale_px, camera) / length_m)
+    rig = float(np.hypot(rig_ratio, RIG_BASELINE))
     step_m = length_m / float(known.sum())
-    random = _random_share(step_m, length_m, sigma_m, np.deg2rad(sigma_deg))
+    random = _random_ratio(step_m, length_m, sigma_m, np.deg2rad(sigma_deg))
     rests_on_px = length_m / float(steps_m[known] @ (1.0 / scale_px))
     return ExpectedDrift(
         percent=100.0 * float(np.hypot(rig, random)),
@@ -156,14 +156,14 @@ def expected_drift(
     )
 
 
-def _scale_share(scale_px: Float64, camera: RectifiedCamera) -> Float64:
+def _scale_ratio(scale_px: Float64, camera: RectifiedCamera) -> Float64:
     """What an error of all disparities does to the lengths (N,) of steps, as a share."""
     yaw_px = camera.focal_px * np.deg2rad(RIG_YAW_DEG)
     return np.asarray(np.hypot(RIG_DISPARITY_PX, yaw_px) / scale_px)
 
 
-def _random_share(step_m: float, length_m: float, sigma_m: Float64, sigma_rad: Float64) -> float:
-    """What errors of single steps add up to over a segment, as a share of its length.
+def _random_ratio(step_m: float, length_m: float, sigma_m: Float64, sigma_rad: Float64) -> float:
+    """What errors of single steps add up to over a segment, as a fraction of its length.
 
     Translations add as they are; a turn moves all that follows, on average a third of its square.
     """

@@ -40,7 +40,9 @@ _STATED: Final = np.array([_TURN] * 3 + [_BIAS] * 3 + [_TIME_OFFSET_S])
 _MIRRORED: Final = "its axes are left-handed"
 _IN_DEGREES: Final = "its rates are in degrees per second"
 _CONTRADICTED: Final = 2.0  # how much better a faulty file explains turns than a right one would
-_UNEXPLAINED: Final = 0.3  # share of the turns (rms) that may be left where a gyro is that of a rig
+_UNEXPLAINED: Final = (
+    0.3  # fraction of the turns (rms) that may be left where a gyro is that of a rig
+)
 
 
 @dataclass(frozen=True, eq=False)

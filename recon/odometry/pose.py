@@ -30,7 +30,7 @@ from recon.odometry.protocol import OdometryHealth
 REPROJECTION_PX: Final = 2.0  # RANSAC's inlier limit
 _SAMPLES: Final = 200  # RANSAC's samples at most
 MIN_INLIERS: Final = 15  # fewer agreeing tracks give no pose
-_MIN_INLIER_SHARE: Final = 0.3  # a smaller share of agreeing tracks gives no pose
+_MIN_INLIER_RATIO: Final = 0.3  # a smaller fraction of agreeing tracks gives no pose
 
 
 def locate_camera(
@@ -56,7 +56,7 @@ def locate_camera(
 
 def enough_agree(agreeing: int, tracks: int) -> bool:
     """Whether so many of the tracks agree that the pose counts as measured."""
-    return agreeing >= max(MIN_INLIERS, _MIN_INLIER_SHARE * tracks)
+    return agreeing >= max(MIN_INLIERS, _MIN_INLIER_RATIO * tracks)
 
 
 def _agreement(
@@ -343,7 +343,7 @@ def model_of(camera: RectifiedCamera) -> bundle.BundleModel:
     )
 
 
-INDEPENDENCE: Final = 0.25  # share of the tracks whose errors count as independent
+INDEPENDENCE: Final = 0.25  # fraction of the tracks whose errors count as independent
 _BEST_PX: Final = 0.05
 """However well features fit, they count as no better: on planes with exact truth they are off by
 0.03 px to 0.12 px."""
@@ -392,7 +392,7 @@ def newest_health(
 def _scale_px(disparity: Float64, camera: RectifiedCamera) -> float:
     """The disparity that fixes the length of a motion, from those (N,) of the features.
 
-    A disparity gives a share of the depth, so a feature counts as much as the square of its own.
+    A disparity gives a fraction of the depth, so a feature counts as much as the square of its own.
     """
     d = disparity[np.isfinite(disparity)] + camera.doffs_px
     return float(d @ d / d.sum()) if len(d) else float("nan")

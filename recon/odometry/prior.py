@@ -80,7 +80,7 @@ class MotionPrior:
     def sigmas(self, T_from_to: Float64) -> tuple[float, float]:
         """Standard deviations of a motion: translation in metres, rotation in degrees."""
         s, length_m = self.settings, float(np.linalg.norm(T_from_to[:3, 3]))
-        return s.sigma_m + s.sigma_share * length_m, s.sigma_deg
+        return s.sigma_m + s.sigma_ratio * length_m, s.sigma_deg
 
     def _pose_at(self, time_s: float) -> Float64 | None:
         """The pose (4, 4) at a time, interpolated; None = outside the path or in a gap."""
@@ -95,5 +95,5 @@ class MotionPrior:
         if gap_s > self.settings.max_gap_s:
             return None
         T_before = self.path.T_world_camera[after - 1]
-        share = float((time_s - times_s[after - 1]) / gap_s)
-        return np.asarray(T_before @ part_of(invert(T_before) @ T_after, share))
+        ratio = float((time_s - times_s[after - 1]) / gap_s)
+        return np.asarray(T_before @ part_of(invert(T_before) @ T_after, ratio))

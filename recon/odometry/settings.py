@@ -23,8 +23,8 @@ class PriorSettings(Settings):
     sigma_m: float = Field(0.03, ge=1e-06, le=1000000.0)
     """Standard deviation of its motion from frame to frame. State here what your sensor is worth:
     the cameras are believed where it is worse."""
-    sigma_share: float = Field(0.03, ge=0.0, le=1000.0)
-    """Share of the motion's length that is added to `sigma_m`."""
+    sigma_ratio: float = Field(0.03, ge=0.0, le=1000.0)
+    """Fraction of the motion's length that is added to `sigma_m`."""
     sigma_deg: float = Field(0.5, ge=1e-06, le=360.0)
     """Standard deviation of its rotation from frame to frame."""
 

@@ -30,7 +30,7 @@ from recon.places.keyframe import points_of
 from recon.places.pose_graph import PoseGraph, solve_damped
 
 _ROUNDS: Final = 12
-_STILL: Final = 1e-4  # gain of a step, as a share of the cost, that is not worth another one
+_STILL: Final = 1e-4  # gain of a step, as a fraction of the cost, that is not worth another one
 _OF_MEDIAN: Final = 1.4826  # standard deviations of a normal error in a median absolute one
 _LEAST_PX: Final = 0.05  # however well features fit, they count as no better
 
@@ -144,14 +144,14 @@ class Bundle:
         steps = np.einsum("pij,pj->pi", inverse, change - linear.g_point)
         return moved, state[1] + steps
 
-    def measured(self, state: State, share: float) -> Bundle:
+    def measured(self, state: State, ratio: float) -> Bundle:
         """Return it with standard deviations as its residuals show them.
 
-        ``share`` is that of the sightings whose errors count as independent.
+        ``ratio`` is that of the sightings whose errors count as independent.
         """
         off = np.abs(self.residuals_px(state))
         unknowns = 3 * self.seen.points + 6 * int(self.graph.free.sum())
-        more = np.sqrt(off.size / max(off.size - unknowns, 1) / share)
+        more = np.sqrt(off.size / max(off.size - unknowns, 1) / ratio)
         uv, d = (
             max(_OF_MEDIAN * float(np.nanmedian(part)), _LEAST_PX) * float(more)
             for part in (off[:, :2], off[:, 2])

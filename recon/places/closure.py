@@ -29,7 +29,7 @@ _KEPT: Final = 0.25  # least weight of a loop that is believed
 _NODE_M: Final = 5.0  # path between two nodes of the graph
 _MAX_NODES: Final = 4000  # longer drives get nodes farther apart; so many take some seconds
 _LOOP_SIGMA_M: Final = 0.05  # standard deviation of a loop that more matches do not improve
-_LOOP_SHARE: Final = 0.03
+_LOOP_RATIO: Final = 0.03
 """Standard deviation that is added per distance between its two frames: features that moved farther
 match worse, and not evenly."""
 
@@ -41,7 +41,7 @@ _MAX_DEFORMATION_CHI2: Final = (
     6.0  # mean chi-square of the odometry edges above which no loop is believed
 )
 USUAL: Final = 0.3
-"""What odometry usually drifts, as a share of what it may: measured positions, whose errors do not
+"""What odometry usually drifts, as a fraction of what it may: measured positions, whose errors do not
 grow, would make a path as rough as they are if it counted for less."""
 
 _HELD_ROUNDS: Final = 2
@@ -152,9 +152,9 @@ def join_drives(
     ties_of = [_tied_frames(ties, number) for number in range(len(drives))]
     nodes = _spaced(drives, ties_of)
     begins = np.cumsum([0, *map(len, nodes)]).tolist()
-    share = 1.0 if held is None else USUAL
+    ratio = 1.0 if held is None else USUAL
     chains = [
-        odometry_edges(drive, own, begin, share)
+        odometry_edges(drive, own, begin, ratio)
         for drive, own, begin in zip(drives, nodes, begins[:-1], strict=True)
     ]
     edges = [_tie_edge(tie, drives, nodes, begins) for tie in ties]
@@ -175,7 +175,7 @@ def join_drives(
         return None
     deformations = [np.mean([misfit(edge, poses) for edge in chain]) for chain in chains if chain]
     kept = weights >= _KEPT
-    if share**2 * max(deformations, default=0.0) > _MAX_DEFORMATION_CHI2 or (
+    if ratio**2 * max(deformations, default=0.0) > _MAX_DEFORMATION_CHI2 or (
         ties and not kept.any()
     ):
         return None
@@ -189,7 +189,7 @@ def loop_bias(loop: Loop, scale: float = 1.0) -> Drift:
     if loop.same_frame:
         return Drift(0.0, 0.0)
     apart_m = float(np.linalg.norm(loop.T_first_last[:3, 3]))
-    position_m = math.hypot(scale * _LOOP_SIGMA_M, _LOOP_SHARE * apart_m)
+    position_m = math.hypot(scale * _LOOP_SIGMA_M, _LOOP_RATIO * apart_m)
     return Drift(position_m, math.radians(_LOOP_SIGMA_DEG))
 
 
@@ -298,9 +298,9 @@ def _solve_held(
 
 
 def odometry_edges(
-    drive: DrivePath, nodes: NDArray[np.intp], begin: int, share: float
+    drive: DrivePath, nodes: NDArray[np.intp], begin: int, ratio: float
 ) -> list[PoseEdge]:
-    """The edges along a drive, with a share of the drift that is possible, and all that is stated.
+    """The edges along a drive, with a fraction of the drift that is possible, and all that is stated.
 
     Nodes are numbered from ``begin``.
     """
@@ -314,7 +314,7 @@ def odometry_edges(
         drift = drift_over(between_m, drive.scale)
         stated = np.repeat(drive.variance[last] - drive.variance[first], 3)
         T = invert(poses[first]) @ poses[last]
-        information = _inverse(share**2 * drift.covariance + np.diag(stated))
+        information = _inverse(ratio**2 * drift.covariance + np.diag(stated))
         edges.append(PoseEdge(k, k + 1, T, information))
     return edges
 
@@ -365,8 +365,8 @@ def optimise_path(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float
         from_a = T_world_node[i] @ invert(old[a]) @ old[frame]
         from_b = T_world_node[j] @ invert(old[b]) @ old[frame]
         span = float(path_m[b] - path_m[a])
-        share = float(path_m[frame] - path_m[a]) / span if span > 0 else 0.0
-        new[frame] = orthonormalise(pose_between(from_a, from_b, share))
+        ratio = float(path_m[frame] - path_m[a]) / span if span > 0 else 0.0
+        new[frame] = orthonormalise(pose_between(from_a, from_b, ratio))
     still = nodes[(T_world_node == old[nodes]).all(axis=(1, 2))]
     new[still] = old[still]  # which rounding has moved
     return replace(drive.trajectory, T_world_camera=new)

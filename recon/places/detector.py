@@ -30,8 +30,8 @@ from recon.places.verify import Verdict, verify
 
 CONTRADICTED: Final = "odometry contradicts"
 """Why a loop is refused that differs from odometry by more than its drift explains."""
-_SEEN_SHARE: Final = 0.75
-"""Share of what either of a view and the last keyframe shows, and the other can see, from which on
+_SEEN_RATIO: Final = 0.75
+"""Fraction of what either of a view and the last keyframe shows, and the other can see, from which on
 the view is no new one."""
 
 _HERE: Final = (3, 3)
@@ -40,7 +40,7 @@ with places that odometry says it may be near."""
 
 _ANYWHERE: Final = (10, 8)  # the same where odometry says nothing: another segment of the drive
 _MIN_LIKENESS: Final = 0.3
-"""Least likeness of a candidate, as a share of that of two neighbouring keyframes."""
+"""Least likeness of a candidate, as a fraction of that of two neighbouring keyframes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,14 +92,14 @@ class NewViews:
         if last is None or last.segment != segment:
             return True
         T_last_new = invert(last.T_world_camera) @ T_world_camera
-        shares = (
+        ratios = (
             self._share_in_view(coarse_of(disparity), T_last_new),
             self._share_in_view(last.coarse, invert(T_last_new)),
         )
-        return min(shares) < _SEEN_SHARE
+        return min(ratios) < _SEEN_RATIO
 
     def _share_in_view(self, coarse: Float32, T: Float64) -> float:
-        """Return the share of what one view shows that another one can see."""
+        """Return the fraction of what one view shows that another one can see."""
         camera = self._camera
         u, v, _ = project(apply(T, coarse_points(coarse, camera)), camera)
         with np.errstate(invalid="ignore"):

@@ -24,7 +24,7 @@ class Loop:
     # the later frame
     information: Float64
     inliers: int  # matches that agree in both frames
-    dense_share: float  # share of the coarse disparities that agree
+    dense_ratio: float  # fraction of the coarse disparities that agree
     same_frame: bool = False  # whether the two are one frame, in two recordings that overlap
 
     def __post_init__(self) -> None:

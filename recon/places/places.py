@@ -19,8 +19,8 @@ from recon.core.values.arrays import Bool, Float64
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
 _BETWEEN: Final = 3.0  # path between two places of a segment that are compared, in reaches
-_REACH: Final = 0.5  # share of the depth of what is seen, within which most of it is seen, too
-_APART: Final = 0.5  # share of that distance which is between two candidates
+_REACH: Final = 0.5  # fraction of the depth of what is seen, within which most of it is seen, too
+_APART: Final = 0.5  # fraction of that distance which is between two candidates
 VIEW_DEG: Final = 45.0  # largest angle between viewing directions that see enough in common
 
 
@@ -197,7 +197,7 @@ class WordIndex:
 _LOST_FACTOR: Final = 20.0  # metres that one metre of extrapolated path counts as
 _LOST_M: Final = 2.0  # path that is added for each frame without a measurement
 SIGMAS: Final = 3.5  # largest possible deviation from odometry, in standard deviations
-SHARE: Final = 0.02  # standard deviation of a position, as a share of the path
+SHARE: Final = 0.02  # standard deviation of a position, as a fraction of the path
 TURN_DEG: Final = 0.15
 """Standard deviation of the heading after 1 m; it grows with the root of the path."""
 
@@ -256,7 +256,7 @@ _OTHER_UNIT: Final = 3.0
 """A foot, the unit of surveys that is nearest to a metre, is 3.28 times shorter."""
 
 _TINY: Final = 1e-12
-_SHORTEST_M: Final = 0.1  # path below which nothing is a share of it
+_SHORTEST_M: Final = 0.1  # path below which nothing is a fraction of it
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ _MAX_SIGMA_M: Final = 0.3  # loops less certain than this, on a road, in any dir
 _DENSE_TOLERANCE_PX: Final = 1.0
 """Largest difference between a predicted and a seen disparity that agree."""
 
-_DENSE_TOLERANCE_SHARE: Final = 0.03  # share of the disparity that is added to it
-_MIN_DENSE_SHARE: Final = 0.75  # least share of the dense points that agree
+_DENSE_TOLERANCE_RATIO: Final = 0.03  # fraction of the disparity that is added to it
+_MIN_DENSE_RATIO: Final = 0.75  # least fraction of the dense points that agree
 _MIN_DENSE_POINTS: Final = 50  # least number of dense points that both frames see
 
 
@@ -55,7 +55,7 @@ def verify(
     """Whether two keyframes show the same place.
 
     Matches must be mutually best. The motions found in either direction must be inverse to each
-    other. The inliers must be many, a fair share of the matches, spread over both images, and
+    other. The inliers must be many, a fair fraction of the matches, spread over both images, and
     determine the motion in all directions. The coarse disparities must agree with it, too.
     """
     cameras = (first_camera or camera, camera)
@@ -64,7 +64,7 @@ def verify(
         return Verdict(None, aligned)
     T, inliers = aligned.T_first_last, int(aligned.agree.sum())
     dense = dense_agreement(first, last, T, *cameras)
-    if dense < _MIN_DENSE_SHARE:
+    if dense < _MIN_DENSE_RATIO:
         return Verdict(None, "surfaces differ")
     return Verdict(Loop(first.frame, last.frame, T, aligned.information, inliers, dense))
 
@@ -157,7 +157,7 @@ def dense_agreement(
     first_camera: RectifiedCamera,
     last_camera: RectifiedCamera,
 ) -> float:
-    """The share of coarse disparities that the other frame confirms, in the worse direction.
+    """The fraction of coarse disparities that the other frame confirms, in the worse direction.
 
     A smaller disparity than predicted means seeing through the other's surface: a contradiction. A
     larger one means that something is in front of it, which does not count. 0 where the two frames
@@ -174,11 +174,11 @@ def dense_agreement(
 def _confirmed(
     xyz: Float64, target: Keyframe, T_target_source: Float64, camera: RectifiedCamera
 ) -> float:
-    """The share of points of another frame that the target sees where they should be."""
+    """The fraction of points of another frame that the target sees where they should be."""
     u, v, d = project(apply(T_target_source, xyz), camera)
     step, half = coarse_grid(target.coarse, camera)
     off = _interpolated(target.coarse, (u - half) / step, (v - half) / step) - d
-    tolerance = _DENSE_TOLERANCE_PX + _DENSE_TOLERANCE_SHARE * np.abs(d)
+    tolerance = _DENSE_TOLERANCE_PX + _DENSE_TOLERANCE_RATIO * np.abs(d)
     with np.errstate(invalid="ignore"):
         comparable = off <= tolerance  # False for NaN, unknown in one of the frames
     if int(comparable.sum()) < _MIN_DENSE_POINTS:

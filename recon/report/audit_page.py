@@ -99,7 +99,7 @@ def frames_figure(looks: Sequence[PairMeasures]) -> bytes:
 
 def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
     """Return the measurements of an audit as subject and text of lines, in display order."""
-    known, swapped = functools.partial(_known, summary), summary["swapped_share"]
+    known, swapped = functools.partial(_known, summary), summary["swapped_ratio"]
     depths_m = summary.get("depth_error_m", {})
     lines = {
         "frames": _frames(summary),
@@ -146,10 +146,10 @@ def _by_motion(found: Mapping[str, Any]) -> str:
     )
 
 
-def _depth_off(share: Mapping[str, float | None]) -> str:
-    if share["mean"] is None or share["sigma"] is None:
+def _depth_off(ratio: Mapping[str, float | None]) -> str:
+    if ratio["mean"] is None or ratio["sigma"] is None:
         return "infinite"
-    return f"{share['mean']:+.1f} ± {1.96 * share['sigma']:.1f} %"
+    return f"{ratio['mean']:+.1f} ± {1.96 * ratio['sigma']:.1f} %"
 
 
 def _mended(mended: Mapping[str, Any]) -> str:

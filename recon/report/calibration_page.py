@@ -63,8 +63,8 @@ def coverage_figure(result: CalibrationRun) -> bytes:
         colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(result.fit.views)))
         for view, colour in zip(result.fit.views, colours, strict=True):
             axes.plot(*view.seen[side].pixels.T, ".", color=colour, markersize=3.5, alpha=0.8)
-        share = result.summary[f"coverage_{name}"]
-        axes.set_title(f"{name.capitalize()}: {100 * share:.0f} % of the cells")
+        ratio = result.summary[f"coverage_{name}"]
+        axes.set_title(f"{name.capitalize()}: {100 * ratio:.0f} % of the cells")
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
         axes.set_xticks(np.linspace(0, width, _CELLS[0] + 1)[1:-1], [])
         axes.set_yticks(np.linspace(0, height, _CELLS[1] + 1)[1:-1], [])

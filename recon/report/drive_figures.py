@@ -34,14 +34,14 @@ def path_figure(
     truth: Trajectory | None,
     T_map_world: NDArray[Any],
     health: Sequence[OdometryHealth] = (),
-    radius_share: float = 0.0,
+    radius_ratio: float = 0.0,
 ) -> bytes:
     """Draw the path in map axes from above, untrusted poses marked, circles of 95 % certainty."""
     path = seen_from_above(estimate, T_map_world)
     lines: list[Line] = [(path, ESTIMATE_LINE)]
-    if radius_share > 0.0:
+    if radius_ratio > 0.0:
         look = {"color": style.ESTIMATE, "linewidth": 0.8, "label": "95 % (expected drift)"}
-        lines.append((_circles(path, radius_share * estimate.distances_m), look))
+        lines.append((_circles(path, radius_ratio * estimate.distances_m), look))
     if truth is not None:
         lines.insert(0, (seen_from_above(truth, T_map_world), TRUTH_LINE))
     visual_m = np.array([record.visual_m or (np.nan,) * 3 for record in health]).reshape(-1, 3)

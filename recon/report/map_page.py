@@ -45,8 +45,8 @@ def map_content(
     path, odometry = (one.select(joined) for one in (session.trajectory, session.odometry))
     health = tuple(compress(session.health, joined))
     number = np.cumsum(joined) - 1  # of each frame among those that are joined
-    drift = expected_drift(path, health, session.camera, rig.length_share)
-    radius_share = 0.0 if drift is None else drift.radius_share
+    drift = expected_drift(path, health, session.camera, rig.length_ratio)
+    radius_ratio = 0.0 if drift is None else drift.radius_ratio
     closed = [(loop["first"], loop["last"]) for loop in session.loops.get("closed", ())]
     pairs = [(int(number[a]), int(number[b])) for a, b in closed if joined[a] and joined[b]]
     true_path = {} if truth is None else {"true path": truth}
@@ -56,7 +56,7 @@ def map_content(
         "health": health,
         "metrics": errors.path,
         "figures": {
-            "path": figures.path_figure(path, truth, T_map_world, health, radius_share),
+            "path": figures.path_figure(path, truth, T_map_world, health, radius_ratio),
             "loops": figures.loops_figure(odometry, path, pairs, T_map_world) if pairs else None,
             "drift": None if truth is None else figures.drift_figure(path, truth, health),
             "health": figures.health_figure(health) if health else None,

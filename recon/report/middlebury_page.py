@@ -27,7 +27,7 @@ Figures = Mapping[str, Any]  # as in ``summary.json``
 Path = tuple[str, ...]  # keys of a figure in them
 _WIDTH_PX: Final = 300  # largest width of an image in the report
 _GAP_PX: Final = 6
-_LEAST_SHARE: Final = 0.001
+_LEAST_RATIO: Final = 0.001
 
 
 def draw_result(result: SceneResult, run: RunDirectory) -> None:
@@ -64,22 +64,22 @@ def write_middlebury_page(summary: Mapping[str, Any], run: RunDirectory) -> None
 
 @style.styled
 def reliability_figure(matchers: Mapping[str, Figures]) -> bytes:
-    """Draw the share of correct pixels by confidence; below, the share of pixels in each bin."""
+    """Draw the fraction of correct pixels by confidence; below, the fraction of pixels in each bin."""
     ratios: dict[str, Any] = {"sharex": True, "height_ratios": (4, 1)}
     figure, (upper, lower) = style.subplots(style.HALF_IN, 5.0, 2, **ratios)
     upper.plot((0, 1), (0, 1), color=style.FAINT, linestyle="--", linewidth=1, label="calibrated")
     for n, (name, curves) in enumerate(matchers.items()):
         bins, colour = curves["reliability"], f"C{n}"
-        confidence, right, share = _floats(bins, "confidence", "right", "share")
-        shown = share >= _LEAST_SHARE
+        confidence, right, ratio = _floats(bins, "confidence", "right", "ratio")
+        shown = ratio >= _LEAST_RATIO
         label = f"{name}: ECE {curves['ece']:.3f}"
         upper.plot(confidence[shown], right[shown], "o-", color=colour, markersize=4, label=label)
-        width = 1 / len(share) / len(matchers)
-        places = np.arange(len(share)) / len(share) + (n + 0.5) * width
-        lower.bar(places, share, width=0.9 * width, color=colour)
-    upper.set(ylim=(0, 1), ylabel="share of right pixels")
+        width = 1 / len(ratio) / len(matchers)
+        places = np.arange(len(ratio)) / len(ratio) + (n + 0.5) * width
+        lower.bar(places, ratio, width=0.9 * width, color=colour)
+    upper.set(ylim=(0, 1), ylabel="fraction of right pixels")
     upper.legend(loc="upper left")
-    lower.set(xlim=(0, 1), xlabel="confidence", ylabel="share of pixels")
+    lower.set(xlim=(0, 1), xlabel="confidence", ylabel="fraction of pixels")
     return style.to_png(figure)
 
 
@@ -213,7 +213,7 @@ def _kind_table(title: str, matchers: Figures, mask: str) -> Table:
     rows = []
     for name, kind in product(matchers, KINDS):
         found = matchers[name]["weighted"]
-        cells = (_at(found, (mask, kind, *path)) for path in (("share",), ("bad", "2"), ("wrong",)))
+        cells = (_at(found, (mask, kind, *path)) for path in (("ratio",), ("bad", "2"), ("wrong",)))
         # Of all pixels, occluded ones too.
         ece = _at(found, ("confidence", f"ece_{kind}")) if mask == "all" else None
         rows.append((f"{name}, {kind}", *map(number, cells), number(ece, 3)))

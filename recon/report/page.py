@@ -163,7 +163,7 @@ def _url(image: Image.Image) -> str:
 
 @style.styled
 def timing_figure(stages: Mapping[str, float]) -> bytes:
-    """Draw time and share of each stage, in the order of the mapping."""
+    """Draw time and fraction of each stage, in the order of the mapping."""
     figure, axes = style.subplots(style.HALF_IN, max(1.6, 0.42 * len(stages) + 0.9))
     seconds = np.asarray(list(stages.values()), dtype=np.float64)
     total = max(float(seconds.sum()), 1e-12)

@@ -165,9 +165,9 @@ def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
     figure = _image(style.colour_disparity(disparity.values, limits), disparity.inferred)
     bar = _colour_bar(figure, style.DISPARITY_SCALE, limits, "disparity in pixels")
     _mark_depths(bar, limits, camera)
-    shares = (100 * kind.mean() for kind in (disparity.measured, disparity.inferred))
+    ratios = (100 * kind.mean() for kind in (disparity.measured, disparity.inferred))
     seen = "Disparities: {}; {:.1f} % measured, {:.1f} % inferred"
-    return style.to_png(figure, seen.format(style.spread(disparity.values, " px"), *shares))
+    return style.to_png(figure, seen.format(style.spread(disparity.values, " px"), *ratios))
 
 
 @style.styled
@@ -208,11 +208,11 @@ def error_figure(error_px: NDArray[Any], inferred: Bool | None = None) -> bytes:
 
 @style.styled
 def reasons_figure(disparity: Disparity) -> bytes:
-    """Draw why each pixel has a disparity or not, and the share of each reason."""
+    """Draw why each pixel has a disparity or not, and the fraction of each reason."""
     figure = _image(style.colour_reasons(disparity.reason))
-    shares = disparity.reason_shares
-    labels = [f"{style.REASON_LABELS[reason]} {100 * shares[reason]:.1f} %" for reason in shares]
-    handles = [*map(style.colour_key, labels, map(style.REASON_COLOURS.__getitem__, shares))]
+    ratios = disparity.reason_ratios
+    labels = [f"{style.REASON_LABELS[reason]} {100 * ratios[reason]:.1f} %" for reason in ratios]
+    handles = [*map(style.colour_key, labels, map(style.REASON_COLOURS.__getitem__, ratios))]
     columns = 4 if is_wide(disparity.reason.shape) else 3
     middle = 0.5 * _BELOW_IN / figure.get_size_inches()[1]
     figure.legend(handles=handles, loc="center", ncols=columns, bbox_to_anchor=(0.5, middle))

@@ -19,7 +19,7 @@ from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
 from recon.run.directory import RunDirectory
 
 _MAX_POINTS: Final = 20_000
-_NEAR_SHARE: Final = 0.9  # as the caption says
+_NEAR_RATIO: Final = 0.9  # as the caption says
 # Dashed, as both printed methods give a value to the same pixels.
 _LINES: Final = {
     paper.CORRECTED: (style.ESTIMATE, "-"),
@@ -78,7 +78,7 @@ def _view(result: paper.MethodResult) -> Json | None:
     cloud = result.cloud
     if len(cloud) and result.method != paper.CORRECTED:
         # Integer disparities near 0 give layers far behind everything, which would shrink the rest.
-        cloud = cloud.select(cloud.xyz[:, 2] <= np.quantile(cloud.xyz[:, 2], _NEAR_SHARE))
+        cloud = cloud.select(cloud.xyz[:, 2] <= np.quantile(cloud.xyz[:, 2], _NEAR_RATIO))
     return plot_scene(Scene(T_UPRIGHT_CAMERA, cloud), _MAX_POINTS)
 
 

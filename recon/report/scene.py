@@ -49,7 +49,7 @@ _LAYOUT: Final = {
 # By its colours, as plotly.js does not know the name.
 _TURBO: Final = get_colorscale("Turbo")
 _PATH_COLOURS: Final = ("#ff5252", "#ffb74d", "#81c784")
-_OUTLIER_SHARE: Final = 0.002
+_OUTLIER_RATIO: Final = 0.002
 # Candidate viewpoints: from behind (x is forward), from the sides, and from above.
 _TURNS_RAD: Final = np.radians(np.arange(-75.0, 76.0, 15.0))
 _ABOVE_RAD: Final = np.radians((25.0, 35.0, 50.0))
@@ -165,7 +165,7 @@ def _without_outliers(cloud: PointCloud) -> PointCloud:
     """Drop the few points far from all others, which would shrink the rest."""
     if not len(cloud):
         return cloud
-    low, high = np.quantile(cloud.xyz, (_OUTLIER_SHARE, 1.0 - _OUTLIER_SHARE), axis=0)
+    low, high = np.quantile(cloud.xyz, (_OUTLIER_RATIO, 1.0 - _OUTLIER_RATIO), axis=0)
     room = 0.1 * (high - low)
     inside = ((cloud.xyz >= low - room) & (cloud.xyz <= high + room)).all(axis=1)
     return cloud.select(inside)

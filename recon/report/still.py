@@ -88,9 +88,9 @@ def _drawn(trace: Json) -> tuple[Float64, UInt8]:
     if isinstance(look["color"], str):
         return xyz, np.tile(np.array(ImageColor.getrgb(look["color"]), np.uint8), (len(xyz), 1))
     ends, named = zip(*look["colorscale"], strict=True)
-    share = _unpacked(look["color"]) / max(look["cmax"], 1)
+    ratio = _unpacked(look["color"]) / max(look["cmax"], 1)
     bands = np.array([ImageColor.getrgb(name) for name in named]).T
-    return xyz, np.stack([np.interp(share, ends, band) for band in bands], 1).astype(np.uint8)
+    return xyz, np.stack([np.interp(ratio, ends, band) for band in bands], 1).astype(np.uint8)
 
 
 def _unpacked(values: Any) -> NDArray[Any]:

@@ -32,9 +32,9 @@ _RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth
 # the frame reports others.
 _BY_IMAGES: Final = frozenset({"black", "gain", "blur", "features"})
 _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
-# Share of pixels with a measured disparity below which a pair is warned of: real ones, even of bare
+# Fraction of pixels with a measured disparity below which a pair is warned of: real ones, even of bare
 # walls, exceed 40 %. It is also warned of where more was inferred than measured.
-_FEW_MEASURED_SHARE: Final = 0.25
+_FEW_MEASURED_RATIO: Final = 0.25
 # Findings with which rows and motion say nothing about the calibration.
 _NOT_OF_THE_RIG: Final = frozenset(
     {"lag", "nonrigid", "stabilised", "swapped", "size", "frozen", "unreadable"}
@@ -157,7 +157,7 @@ def _figures(look: Look) -> dict[str, Any]:
         "sharpness_left": sharpness[0],
         "sharpness_right": sharpness[1],
         "features": len(geometry.features),
-        "swapped_share": plain(geometry.swapped_share),
+        "swapped_ratio": plain(geometry.swapped_ratio),
         "time_offset_frames": geometry.offset,
         "time_skew_frames": None if look.skew is None else look.skew[0],
         "baseline_m": camera.baseline_m,
@@ -244,7 +244,7 @@ def check_found(
     doubtful = support is None or support.doubtful
     known = tuple(one.text for one in faults if one.code != "features" or doubtful)
     measured, inferred = (float(kind.mean()) for kind in (disparity.measured, disparity.inferred))
-    if measured >= max(_FEW_MEASURED_SHARE, inferred):
+    if measured >= max(_FEW_MEASURED_RATIO, inferred):
         return known
     advice = (
         "check that both images show the same moment, that left and right are not swapped, that "
@@ -260,7 +260,7 @@ def check_found(
 
 
 def _reasons(disparity: Disparity) -> str:
-    shares = {r: 100 * share for r, share in disparity.reason_shares.items() if r and share >= 0.01}
-    names = {r: r.name.lower().replace("_", " ") for r in shares}
+    ratios = {r: 100 * ratio for r, ratio in disparity.reason_ratios.items() if r and ratio >= 0.01}
+    names = {r: r.name.lower().replace("_", " ") for r in ratios}
     names[Reason.FILLED] = "inferred from planes around"
-    return ", ".join(f"{share:.0f} % {names[r]}" for r, share in list(shares.items())[:2])
+    return ", ".join(f"{ratio:.0f} % {names[r]}" for r, ratio in list(ratios.items())[:2])

@@ -46,7 +46,7 @@ _INLIER_PX: Final = 1.0  # largest distance of an inlier from its epipolar line
 _FEWEST_AT_FIRST: Final = 12
 _MIN_FEATURES: Final = 40  # matches that must agree on one geometry
 _HELD_OUT: Final = 4  # every fourth feature of a single pair is held out of the fit
-_FLAT_SHARE: Final = 0.9  # share of matches on one plane from which the scene counts as flat
+_FLAT_RATIO: Final = 0.9  # fraction of matches on one plane from which the scene counts as flat
 _FOCAL_WIDTHS: Final = (0.5, 0.7, 1.0, 1.4, 2.0, 4.0)  # tried: they decide how pitch bends rows
 _RESOLVED_PX: Final = (
     0.5  # epipolar error that a simpler model may have more: warped images cost more
@@ -136,7 +136,7 @@ def _candidates(
 ) -> tuple[dict[str, Homographies], CalibrationError | None]:
     """Return homographies by model, the simplest first; and why the last one is missing."""
     fits = {"raw": (np.eye(3), np.eye(3))}
-    turns = [H for share in _FOCAL_WIDTHS if (H := _turned(features, size, share)) is not None]
+    turns = [H for ratio in _FOCAL_WIDTHS if (H := _turned(features, size, ratio)) is not None]
     if turns:
         fits["rotation"] = min(turns, key=lambda H: float(_epipolar_errors(H, features).mean()))
     try:
@@ -173,12 +173,12 @@ def _fit(features: PairFeatures, size: Size, min_features: int) -> Homographies:
     some = features.select(agreeing)
     # A plane does not determine the geometry of the cameras.
     _, mask = cv2.findHomography(some.left_uv, some.right_uv, cv2.USAC_MAGSAC, _INLIER_PX)
-    flat_share = 0.0 if mask is None else float(np.mean(mask))
-    if flat_share > _FLAT_SHARE:
+    flat_ratio = 0.0 if mask is None else float(np.mean(mask))
+    if flat_ratio > _FLAT_RATIO:
         raise CalibrationError(
             "the scene is flat and does not determine the camera geometry",
-            got=f"{100 * flat_share:.0f} % of the matches on one plane",
-            expected=f"at most {100 * _FLAT_SHARE:g} %",
+            got=f"{100 * flat_ratio:.0f} % of the matches on one plane",
+            expected=f"at most {100 * _FLAT_RATIO:g} %",
             hint="use a scene with both near and far objects, or calibrate: recon calibrate",
         )
     return rectifying_homographies(F, some, size)
@@ -283,9 +283,9 @@ def find_fundamental(features: PairFeatures, inlier_px: float) -> tuple[Float64 
     """
     left, right = features.left_uv.astype(np.float64), features.right_uv.astype(np.float64)
     best, distances = None, np.full(len(left), np.inf)
-    for method, share in _DRAWS if len(left) >= _FEWEST else ():
+    for method, ratio in _DRAWS if len(left) >= _FEWEST else ():
         try:
-            F, _ = cv2.findFundamentalMat(left, right, method, share * inlier_px, 0.9999, 10000)
+            F, _ = cv2.findFundamentalMat(left, right, method, ratio * inlier_px, 0.9999, 10000)
         except cv2.error:  # no model found
             continue
         if F is None or F.shape != (3, 3):

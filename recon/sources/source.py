@@ -281,7 +281,7 @@ Item = TypeVar("Item")
 Left = TypeVar("Left")
 Right = TypeVar("Right")
 
-_ONE_RATE: Final = 2 / 3  # share of frames with both images, from which cameras have one rate
+_ONE_RATE: Final = 2 / 3  # fraction of frames with both images, from which cameras have one rate
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from recon.sources.settings import SourceSettings
 from recon.sources.source import Recording, pair_frames
 
 _STACKED: Final = frozenset({"top-bottom", "bottom-top"})
-_LONGER: Final = 0.05  # share of a video without a partner: one camera was stopped later
+_LONGER: Final = 0.05  # fraction of a video without a partner: one camera was stopped later
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

@@ -174,7 +174,7 @@ class CloudSettings(Settings):
     max_range_m: float | None = Length(30.0, ge=1e-06, le=1000000.0)
     """Farthest depth kept; none = no limit. The error of a depth grows with its square."""
     max_relative_sigma: float | None = Field(0.1, ge=1e-06, le=1000000.0)
-    """Largest standard deviation of a depth kept, as a share of it; none = no limit. Smaller for
+    """Largest standard deviation of a depth kept, as a fraction of it; none = no limit. Smaller for
     fewer, more certain points."""
     inferred: bool = False
     """Points also of pixels whose disparity is not measured, but that of planes around them; they
@@ -248,7 +248,7 @@ def _or_infinity(limit: float | None) -> float:
 _RADIUS_PX: Final = 2  # half width of the window
 _MAX_GRADIENT: Final = 1.0  # largest disparity gradient of a matchable surface, pixels per pixel
 _TOLERANCE_PX: Final = 0.5  # matching noise allowed on top of the gradient
-_MIN_SUPPORT: Final = 0.36  # share of the window that must lie on the surface of its centre
+_MIN_SUPPORT: Final = 0.36  # fraction of the window that must lie on the surface of its centre
 
 
 def remove_flying_edges(disparity: Disparity) -> Disparity:

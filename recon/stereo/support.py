@@ -21,7 +21,7 @@ from recon.stereo.rectify.features import PairFeatures
 
 _LEAST_ROWS: Final = 64  # lower images are not judged: hardly a feature fits in
 _SHIFT_ROWS: Final = 16
-_SHIFT_SHARE: Final = 1 / 24
+_SHIFT_RATIO: Final = 1 / 24
 """Rows by which images are shifted to see what matches by chance: of their height, and at least.
 
 What is left in common there are edges between large areas, as of two roads: farther shifts, where
@@ -29,7 +29,7 @@ such areas differ too, would take those for matches."""
 _BY_PIXELS: Final = 2.2
 """Times chance from which matches support a pair. Unrelated, mirrored and turned images of ten
 cameras have 0.7 to 2.0, if they are not symmetrical; good pairs 2.3 to 40."""
-_LEAST_SHARE: Final = 0.02
+_LEAST_RATIO: Final = 0.02
 """Of the pixels, beyond chance: fewer support nothing, as those that noise has in common."""
 _MOSTLY: Final = 0.4
 """Of the pixels, which no unrelated pair matches: along upright edges shifted rows match, too."""
@@ -63,7 +63,7 @@ class Support:
     def by_pixels(self) -> bool:
         """Whether dense matches support the pair; they do where hardly a corner is."""
         beyond = self.measured - self.by_chance
-        clearly = self.times_chance >= _BY_PIXELS and beyond >= _LEAST_SHARE
+        clearly = self.times_chance >= _BY_PIXELS and beyond >= _LEAST_RATIO
         return clearly or self.measured >= _MOSTLY
 
     @property
@@ -116,7 +116,7 @@ def measure_support(
         ndisp = estimate_ndisp(pair, searched.min_disparity_px)
         pair = replace(pair, camera=replace(pair.camera, ndisp=ndisp))
     matcher = HalfSizeMatcher(searched, threads)
-    rows = max(_SHIFT_ROWS, round(height * _SHIFT_SHARE))
+    rows = max(_SHIFT_ROWS, round(height * _SHIFT_RATIO))
     measured, *by_chance = (
         float(matcher.match(replace(pair, right=right)).confidence.mean())
         for right in (pair.right, *(np.roll(pair.right, shift, axis=0) for shift in (-rows, rows)))

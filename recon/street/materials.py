@@ -73,9 +73,9 @@ def albedo(soup: TriangleSoup, faces: Int32, hits: SurfaceHits, seed: int) -> Fl
     return np.clip(rgb, 0.0, 1.0)
 
 
-def _blend(rgb: Float64, paint: tuple[float, float, float], share: Float64) -> Float64:
+def _blend(rgb: Float64, paint: tuple[float, float, float], ratio: Float64) -> Float64:
     """Cover a fraction (N,) of each footprint with a display colour."""
-    cover = share[:, None]
+    cover = ratio[:, None]
     return np.asarray(rgb * (1.0 - cover) + np.array(paint) ** GAMMA * cover)
 
 

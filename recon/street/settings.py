@@ -77,7 +77,7 @@ class StreetScene(StreetSettings):
     #: Brightness of the right camera relative to the left, and grey levels added in its images.
     right_gain: float = Field(default=1.0, gt=0.0, le=4.0)
     right_offset_dn: float = Field(default=0.0, ge=-128.0, le=128.0)
-    #: Share of the time between frames in which the shutter is open: what moves is blurred.
+    #: Fraction of the time between frames in which the shutter is open: what moves is blurred.
     shutter: float = Field(default=0.0, ge=0.0, le=1.0)
     smooth_edges: bool = True  # four rays instead of one per pixel at edges (antialiasing)
     #: Rendering threads, 0 = one per core; does not affect the result.

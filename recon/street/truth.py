@@ -180,8 +180,8 @@ def _level_cut(triangles: Float64, z: float) -> tuple[Float64, Float64]:
     ends = []
     for step in (1, 2):
         other = triangles[row, (lone + step) % 3]
-        share = (z - apex[:, 2]) / (other[:, 2] - apex[:, 2])
-        ends.append(apex + share[:, None] * (other - apex))
+        ratio = (z - apex[:, 2]) / (other[:, 2] - apex[:, 2])
+        ends.append(apex + ratio[:, None] * (other - apex))
     return ends[0], ends[1]
 
 
@@ -189,5 +189,5 @@ def _sample_segments(start: Float64, end: Float64, step_m: float) -> Float64:
     pieces = np.ceil(np.linalg.norm(end - start, axis=1) / step_m).astype(int) + 1
     segment = np.repeat(np.arange(len(start)), pieces + 1)
     first = np.cumsum(pieces + 1) - (pieces + 1)
-    share = (np.arange(len(segment)) - first[segment]) / pieces[segment]
-    return np.asarray(start[segment] + share[:, None] * (end - start)[segment])
+    ratio = (np.arange(len(segment)) - first[segment]) / pieces[segment]
+    return np.asarray(start[segment] + ratio[:, None] * (end - start)[segment])

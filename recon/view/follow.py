@@ -191,8 +191,8 @@ class KeyframeViews:
             pair, disparity = matcher.match(next(source.frames(frame)))
         except ReconError as error:
             return [*lines, f"no images: {error}"], None
-        shares = disparity.reason_shares.items()
-        lines.append(", ".join(f"{REASON_LABELS[r]} {100 * share:.0f} %" for r, share in shares))
+        ratios = disparity.reason_ratios.items()
+        lines.append(", ".join(f"{REASON_LABELS[r]} {100 * ratio:.0f} %" for r, ratio in ratios))
         shown = hatch(colour_disparity(disparity.values), disparity.inferred)
         coloured = shown, colour_reasons(disparity.reason)
         return lines, np.concatenate([pair.colours, *coloured])

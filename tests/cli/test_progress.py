@@ -28,9 +28,9 @@ class Terminal(io.StringIO):
         return True
 
 
-def frame(index: int, *, ok: bool = True, valid_share: float = 0.7) -> FrameResult:
+def frame(index: int, *, ok: bool = True, valid_ratio: float = 0.7) -> FrameResult:
     health = OdometryHealth(ok=ok, inliers=120, notes=("a [bold] note",))
-    return FrameResult(index, 3, 0.25, valid_share, 900, np.eye(4), health)
+    return FrameResult(index, 3, 0.25, valid_ratio, 900, np.eye(4), health)
 
 
 def run(viewer: Progress) -> None:
@@ -48,11 +48,11 @@ def lines(stream: io.StringIO) -> list[dict[str, Any]]:
 def test_every_event_is_one_json_line_with_null_for_nan():
     stream = io.StringIO()
     run(JsonLines(stream))
-    JsonLines(stream).on_step(frame(1, ok=False, valid_share=float("nan")))
+    JsonLines(stream).on_step(frame(1, ok=False, valid_ratio=float("nan")))
     *events, last = lines(stream)
     names = [event["event"] for event in events]
     assert names == ["start", "frame", "frame", "frame", "finish", "stage"]
-    assert (last["index"], last["measured"], last["valid_share"]) == (1, False, None)
+    assert (last["index"], last["measured"], last["valid_ratio"]) == (1, False, None)
     assert (last["position_m"], last["notes"]) == ([0.0, 0.0, 0.0], ["a [bold] note"])
     stream = io.StringIO()
     JsonLines(stream).on_step(SceneDone("Piano", {"sad": {"seconds": 0.25}}, 0.5))

@@ -114,7 +114,7 @@ def test_a_fit_of_the_paths_undoes_what_both_share_and_clouds_are_coloured_by_th
 def test_icp_lays_the_cloud_onto_the_reference_and_every_threshold_has_its_figures(drifted):
     files = (drifted / "drift", drifted / "reference.ply")
     found = run_evaluate_map(*files, icp=True, thresholds_m=(0.1, 0.2))
-    assert found["icp_share"] > 0.9
+    assert found["icp_ratio"] > 0.9
     assert 0.1 < found["icp_moved_m"] < 1.5
     first, second = (one["f_score"] for one in found["by_threshold"])
     assert first <= second

@@ -13,7 +13,7 @@ from recon.evaluation.disparity import (
     evaluate_kinds,
     measure_reliability,
     measure_sparsification,
-    share_within_sigma,
+    ratio_within_sigma,
 )
 from recon.evaluation.middlebury.score import evaluate_middlebury
 
@@ -65,7 +65,7 @@ def test_maps_without_values_or_truth_or_of_another_size_have_no_errors():
         with pytest.raises(EvaluationError, match="no pixel has a known truth"):
             measure(Disparity.from_values(estimate([1])), truth([N]))
     with pytest.raises(EvaluationError, match="both a disparity and a known truth"):
-        share_within_sigma(Disparity.from_values(estimate([N, 1])), truth([1, N]))
+        ratio_within_sigma(Disparity.from_values(estimate([N, 1])), truth([1, N]))
 
 
 def test_plain_arrays_are_evaluated_like_values():
@@ -124,7 +124,7 @@ def made(error_px, confidence=0.8):
 
 def test_share_within_sigma_and_honest_confidence_are_counted():
     pair = made(np.array([[0.2, 0.7, 1.2, 5.0]]))
-    assert [share_within_sigma(*pair, n) for n in (1, 2, 3)] == [0.25, 0.5, 0.75]
+    assert [ratio_within_sigma(*pair, n) for n in (1, 2, 3)] == [0.25, 0.5, 0.75]
     # Pixels are right just as often as their confidence says.
     rng, shape = np.random.default_rng(0), (200, 500)
     confidence = rng.uniform(0, 1, shape)

@@ -90,12 +90,12 @@ def test_icp_finds_the_motion_between_two_samples_of_a_corner(away_m):
     here[:3, 3] = away_m
     small = make_transform(exp_so3(np.array([0.01, -0.02, 0.015])), np.array([0.3, -0.2, 0.1]))
     T = here @ small @ invert(here)
-    found, share = icp(apply(here, corner(0)), apply(T @ here, corner(1)), (2.0, 0.5, 0.2))
+    found, ratio = icp(apply(here, corner(0)), apply(T @ here, corner(1)), (2.0, 0.5, 0.2))
     wrong = invert(here) @ invert(T) @ found @ here
     # Random samples of planes: exact up to the normals at the edges of the corner.
     assert np.linalg.norm(wrong[:3, 3]) < 0.01
     assert angle_rad(wrong) < 1e-3
-    assert share > 0.9
+    assert ratio > 0.9
 
 
 def test_clouds_and_occupancies_that_cannot_be_compared_are_reported():

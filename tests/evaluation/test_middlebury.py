@@ -74,7 +74,7 @@ def test_figures_are_those_of_the_plain_definitions(seed, scale, full, rounded, 
     values = np.where(np.isinf(disp), np.float32(np.nan), disp)
     found = score.evaluate_middlebury(values, truth, rules, occluded=not masked)
 
-    named = {f"bad{t:g}": share for t, share in found.bad.items()}
+    named = {f"bad{t:g}": ratio for t, ratio in found.bad.items()}
     named |= {"invalid": found.invalid, "avgerr": found.avgerr_px, "rms": found.rms_px}
     named |= {f"a{q}": error for q, error in found.quantiles_px.items()}
     # float32 in, float64 sums: what differs is the order of addition.
@@ -228,11 +228,11 @@ def test_what_was_measured_and_what_was_inferred_are_scored_apart(tmp_path):
         assert (inferred["bad"]["2"], inferred["wrong"]) == (100, 100)
         assert inferred["avgerr"] == pytest.approx(16)
         assert {*measured["bad"]} == {"0.5", "1", "2", "4"}
-        assert measured["share"] + inferred["share"] + figures["all"]["invalid"] == (
+        assert measured["ratio"] + inferred["ratio"] + figures["all"]["invalid"] == (
             pytest.approx(100)
         )
-        assert 0 < inferred["share"] < 100
-        assert figures["all"]["sparse"]["bad"]["2"] == pytest.approx(inferred["share"])
+        assert 0 < inferred["ratio"] < 100
+        assert figures["all"]["sparse"]["bad"]["2"] == pytest.approx(inferred["ratio"])
         rated = figures["confidence"]
         assert (rated["ece_measured"], rated["ece_inferred"]) == pytest.approx((0, 0.25))
     text = (out / "tables.txt").read_text()
@@ -264,7 +264,7 @@ def test_results_that_are_none_several_or_given_twice_are_refused(tmp_path):
 
 
 # Measured elsewhere with OpenCV 5 on all 15 scenes of the table, of which 8 are here: bad1, bad2,
-# bad4, avgerr. The shares of single scenes vary by 10 to 30, so means of 8 and 15 may differ.
+# bad4, avgerr. The fractions of single scenes vary by 10 to 30, so means of 8 and 15 may differ.
 ANCHORS = {"opencv-bm": (42.4, 28.6, 21.1, 12.2), "opencv-sgbm": (40.3, 23.0, 15.3, 7.7)}
 
 

@@ -12,7 +12,7 @@ from recon.core.geometry.se3 import T_YUP_FRAME, apply, exp_so3, invert, make_tr
 from recon.core.values import RectifiedCamera, TriangleMesh
 from recon.core.values.camera import project, unproject
 from recon.export.images import DriveImages
-from recon.export.mesh.charts import make_atlas, shares_of, texels_of
+from recon.export.mesh.charts import make_atlas, ratios_of, texels_of
 from recon.export.mesh.cut import vertex_normals
 from recon.export.mesh.texture import textured_mesh
 from recon.export.mesh.views import PosedImage
@@ -172,10 +172,10 @@ def test_charts_do_not_overlap_and_keep_lengths():
     atlas = make_atlas(mesh, 0.01, 4096)
     numbers, found = texels_of(atlas)
     assert {*found.tolist()} == {*range(len(faces))}
-    shares = shares_of(atlas, numbers, found)
-    np.testing.assert_allclose(shares.sum(axis=1), 1, atol=1e-5)
+    ratios = ratios_of(atlas, numbers, found)
+    np.testing.assert_allclose(ratios.sum(axis=1), 1, atol=1e-5)
     # What a texel shows is on the face at the texel's place in the chart, and on the sphere.
-    at = np.einsum("nc,ncd->nd", shares, atlas.places[atlas.mesh.faces[found]])
+    at = np.einsum("nc,ncd->nd", ratios, atlas.places[atlas.mesh.faces[found]])
     texels = np.stack([numbers % atlas.width_px, numbers // atlas.width_px], axis=1) + 0.5
     assert np.abs(at - texels).max() < 0.01
     edges = atlas.mesh.faces[:, [0, 1]]

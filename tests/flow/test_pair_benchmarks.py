@@ -75,8 +75,8 @@ def test_the_other_side_of_a_step_is_counted_near_it_alone(pairs, scene):
     near = given + WIDTH * 5  # and 5 of the sky
     assert found["measured, other side"] == pytest.approx(100 * 3 * 20 / near)
     # Equal confidence says nothing of which are wrong.
-    share = 3 * 20 / given
-    assert 0.5 * share < found["measured, ause at steps"] < share
+    ratio = 3 * 20 / given
+    assert 0.5 * ratio < found["measured, ause at steps"] < ratio
     values[20:, EDGE - 3 : EDGE] = 17  # wrong, but of neither side
     assert pairs.figures(made(values, none), scene)["measured, other side"] == 0
 

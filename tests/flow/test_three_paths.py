@@ -140,11 +140,11 @@ def test_tables_have_the_truths_share_beside_drift(three, monkeypatch):
 
     monkeypatch.setattr(results, "run_here", run_here)
     monkeypatch.setattr(results, "run_once", cache(lambda line: run_here(line, ROOT)))
-    share = truth["as it is"]["t_rel"]["translation"]["errors"]["truth"]["error"]
+    ratio = truth["as it is"]["t_rel"]["translation"]["errors"]["truth"]["error"]
     for table in (results.TABLES["kitti-lenses"], results.TABLES["kitti-sfm"]):
         found = {key: results.output(line, ROOT) for key, line in table.commands.items()}
-        shares = {row["truth's share"] for row in results.rows_of(table, found).values()}
-        assert shares == {f"{share:.2f} %"}
+        ratios = {row["truth's ratio"] for row in results.rows_of(table, found).values()}
+        assert ratios == {f"{ratio:.2f} %"}
     assert sum("three_paths.py" in line for line in ran) == 6  # of three drives and two rigs, once
     rows = results.rows_of(results.TABLES["three-paths"], {"street, refined (x), truth": truth})
     assert rows["street, refined, 10 m"]["segments"] == truth["as it is"]["10"]["segments"]

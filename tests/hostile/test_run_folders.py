@@ -22,8 +22,8 @@ def replaced(content: bytes) -> Alter:
     return lambda path: (path.unlink(), path.write_bytes(content))[0]
 
 
-def cut(share: float) -> Alter:
-    return lambda path: replaced(path.read_bytes()[: int(share * path.stat().st_size)])(path)
+def cut(ratio: float) -> Alter:
+    return lambda path: replaced(path.read_bytes()[: int(ratio * path.stat().st_size)])(path)
 
 
 def moved(metres: float) -> list[list[float]]:

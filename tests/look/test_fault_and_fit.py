@@ -197,9 +197,9 @@ def test_what_an_earlier_drive_knew_counts_as_far_as_nothing_contradicts_it():
     first, alone = fitted(TURN), fitted(NONE, 500)
     windows = [tracks(NONE, 500 + k) for k in range(WINDOWS)]
     both = fit_fault(windows, FAULT, ALL, first)
-    shares = np.sqrt(np.diag(both.covariance) / np.diag(alone.covariance))
+    ratios = np.sqrt(np.diag(both.covariance) / np.diag(alone.covariance))
     # What features that lie alike err by does not average out.
-    assert 0.6 < np.median(shares) < 1.0
+    assert 0.6 < np.median(ratios) < 1.0
     assert rms(off_px(NONE, both.values)).max() < 0.05
     moved, turned = fault(yaw=2e-3), [tracks(fault(yaw=2e-3), k) for k in range(WINDOWS)]
     found = fit_fault(turned, FAULT, ALL, first)
@@ -216,15 +216,15 @@ def test_late_right_images_are_told_apart_from_a_turned_camera(late: float, valu
 
 @pytest.mark.slow
 def test_intervals_hold_of_40_rigs_with_lenses_three_times_worse_than_expected():
-    rng, shares, sigmas = np.random.default_rng(0), [], 3.0 * FAULT.sigmas
+    rng, ratios, sigmas = np.random.default_rng(0), [], 3.0 * FAULT.sigmas
     sigmas[:4] *= 0.1
     for number in range(40):
         values = sigmas * rng.normal(size=len(NAMES))
         found = fitted(values, 100 * number)
-        shares.append(off_px(values, found.values)[:, 1] / np.sqrt(off_squares(found)))
-    assert np.mean(np.abs(shares) <= 1.96, axis=0).min() >= 0.9
+        ratios.append(off_px(values, found.values)[:, 1] / np.sqrt(off_squares(found)))
+    assert np.mean(np.abs(ratios) <= 1.96, axis=0).min() >= 0.9
     # Noise is a third of what features are expected to have, and these do not err alike.
-    assert 0.3 < np.sqrt(np.mean(np.square(shares))) < 1.0
+    assert 0.3 < np.sqrt(np.mean(np.square(ratios))) < 1.0
 
 
 def test_directions_that_a_drive_shows_well_stay_and_others_become_zero():

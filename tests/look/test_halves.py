@@ -35,18 +35,18 @@ def seen(points: int, seed: int, noise_px: float = 0.02) -> TrackWindow:
     return TrackWindow(poses, uvd + rng.normal(0.0, noise_px, uvd.shape), xyz)
 
 
-def biased(window: TrackWindow, which: np.ndarray, share: float) -> TrackWindow:
-    """The same, with disparities of some points too small by a share, as a wrong rig shows them."""
+def biased(window: TrackWindow, which: np.ndarray, ratio: float) -> TrackWindow:
+    """The same, with disparities of some points too small by a ratio, as a wrong rig shows them."""
     uvd = window.uvd.copy()
-    uvd[:, which, 2] *= 1.0 - share
+    uvd[:, which, 2] *= 1.0 - ratio
     z = window.xyz_world.copy()
-    z[which] /= 1.0 - share
+    z[which] /= 1.0 - ratio
     return replace(window, uvd=uvd, xyz_world=z)
 
 
-def windows(share: float, place) -> list[TrackWindow]:
+def windows(ratio: float, place) -> list[TrackWindow]:
     some = [seen(240, seed) for seed in range(6)]
-    return [biased(one, place(one), share) for one in some]
+    return [biased(one, place(one), ratio) for one in some]
 
 
 def test_what_is_off_on_one_side_is_stated_with_half_of_its_size():
@@ -60,8 +60,8 @@ def test_what_is_off_on_one_side_is_stated_with_half_of_its_size():
 
 def test_where_all_are_right_or_off_alike_halves_agree():
     """What all features share, such as a wrong baseline, no half can show."""
-    for share in (0.0, 0.02):
-        alike = windows(share, lambda w: np.ones(len(w.xyz_world), np.bool_))
+    for ratio in (0.0, 0.02):
+        alike = windows(ratio, lambda w: np.ones(len(w.xyz_world), np.bool_))
         assert disagreement(alike, CAMERA) < 0.001
 
 

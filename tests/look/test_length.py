@@ -35,7 +35,7 @@ def measured(street, how: str):
         return (0, FRAMES - 1, float(np.linalg.norm(ends_m[1] - ends_m[0])))
     poses = path.T_world_camera.copy()
     poses[:, :3, 3] *= TYRES
-    settings = PriorSettings(sigma_m=0.01, sigma_share=0.004 if how == "wheels" else 0.03)
+    settings = PriorSettings(sigma_m=0.01, sigma_ratio=0.004 if how == "wheels" else 0.03)
     return MotionPrior(Trajectory(poses, path.timestamps_s), settings)
 
 
@@ -51,17 +51,17 @@ def test_measured_lengths_show_the_baseline(street, wider, how):
     used, only_said = (kept.with_baseline(seen, RigSettings(refine=on)) for on in (True, False))
     assert only_said.calibration is given
     assert used.calibration.baseline_m == pytest.approx(camera.baseline_m, rel=3.0 * seen.sigma)
-    assert used.refined == bool(used.warnings()) == bool(only_said.warnings()) == bool(seen.share)
-    assert bool(seen.share) or wider == 1.0
-    assert used.figures()["baseline"]["percent"] == pytest.approx(100.0 * seen.share)
+    assert used.refined == bool(used.warnings()) == bool(only_said.warnings()) == bool(seen.ratio)
+    assert bool(seen.ratio) or wider == 1.0
+    assert used.figures()["baseline"]["percent"] == pytest.approx(100.0 * seen.ratio)
     raw = seen.applied(as_raw(given))
-    assert raw.T_right_left[0, 3] == pytest.approx(-given.baseline_m * (1.0 + seen.share))
+    assert raw.T_right_left[0, 3] == pytest.approx(-given.baseline_m * (1.0 + seen.ratio))
 
 
 def test_wheels_that_are_known_no_better_than_a_baseline_do_not_show_it(street):
     assert see_baseline(street, CONFIG, measured(street, "unknown wheels")) is None
     gap = MotionPrior(
-        Trajectory(np.stack(2 * [np.eye(4)]), np.array([50.0, 51.0])), PriorSettings(sigma_share=0)
+        Trajectory(np.stack(2 * [np.eye(4)]), np.array([50.0, 51.0])), PriorSettings(sigma_ratio=0)
     )
     assert see_baseline(street, CONFIG, gap) is None
 

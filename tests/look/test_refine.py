@@ -63,7 +63,7 @@ def test_a_turned_right_camera_is_recovered_and_said(street, yaw_deg, enlarged):
     assert rig.calibration.baseline_m == pytest.approx(street.calibration.baseline_m, rel=1e-9)
     # A rig that is to be kept is as far off as it was, and that is in the length of the path.
     kept = replace(rig, calibration=rig.given)
-    assert rig.length_share < kept.length_share
+    assert rig.length_ratio < kept.length_ratio
     assert "used is the calibration as it is" in kept.warnings()[0]
     left = off(true, rig.calibration)
     # Noise, and what is shrunk of a turn that lenses may share: three standard deviations.
@@ -194,7 +194,7 @@ def test_nothing_is_invented_where_motion_shows_little(drive):
     rig = refine_rig(seen, CONFIG, AUTO)
     assert off(world.camera, rig.calibration).moved_px <= 0.05
     # Of how long the path is, little is known, and that is said.
-    assert rig.length_share is None or rig.length_share > 0.02
+    assert rig.length_ratio is None or rig.length_ratio > 0.02
 
 
 def test_depth_behind_infinity_is_said_and_can_be_stored(street):

@@ -101,24 +101,24 @@ FAST = make_transform(STEP[:3, :3], 2.0 * STEP[:3, 3])
 def test_the_true_motion_explains_nearly_every_patch_in_any_exposure(see):
     found = ask(see(np.eye(4)), see(STEP), STEP)
     assert found.informative >= 20
-    assert found.share > 0.9
+    assert found.ratio > 0.9
     before, now = see(np.eye(4)), see(STEP)
     dim = np.rint(0.5 * now.pair.left + 20).astype(np.uint8)
     dimmed = replace(now, pair=replace(now.pair, left=dim))
-    assert ask(before, dimmed, STEP).share == pytest.approx(ask(before, now, STEP).share, abs=0.05)
+    assert ask(before, dimmed, STEP).ratio == pytest.approx(ask(before, now, STEP).ratio, abs=0.05)
 
 
 @pytest.mark.parametrize("wrong", [np.eye(4), FAST, invert(STEP), TURNED])
 def test_a_wrong_motion_does_not(wrong, see):
     found = ask(see(np.eye(4)), see(STEP), wrong)
     assert found.informative >= 8
-    assert found.share < checked.MIN_SHARE
+    assert found.ratio < checked.MIN_RATIO
 
 
 def test_an_image_without_texture_or_dark_now_gives_no_answer(see, blind):
     found = ask(blind(100), blind(100), np.eye(4))
     assert found.informative == 0
-    assert np.isnan(found.share)
+    assert np.isnan(found.ratio)
     assert ask(see(np.eye(4)), blind(2), STEP).informative == 0
 
 
@@ -140,7 +140,7 @@ def test_patches_are_counted_one_by_one(see):
     mixed[:, 200:] = mixed[:, :199:-1]
     found = ask(before, replace(now, pair=replace(now.pair, left=mixed)), STEP)
     assert found.informative > 20
-    assert 0.35 < found.share < 0.65
+    assert 0.35 < found.ratio < 0.65
 
 
 @pytest.mark.parametrize("sigma", [1.0, 3.0, 8.0])

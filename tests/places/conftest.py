@@ -99,13 +99,13 @@ def alike() -> Filmed:
     return Filmed(path="straight", repeat_m=60.0, frames=60, speed_m_per_frame=speed, seed=2)
 
 
-def drifted(truth: Trajectory, *, share: float, turn_deg_per_m: float) -> Trajectory:
+def drifted(truth: Trajectory, *, ratio: float, turn_deg_per_m: float) -> Trajectory:
     """A path with a constant scale and rotation error in each step."""
     poses = [np.eye(4)]
     for step in se3.invert(truth.T_world_camera[:-1]) @ truth.T_world_camera[1:]:
         length = float(np.linalg.norm(step[:3, 3]))
         turn = se3.exp_so3(np.radians([0.1, 1.0, 0.0]) * turn_deg_per_m * length)
-        longer = se3.make_transform(step[:3, :3] @ turn, step[:3, 3] * (1.0 + share))
+        longer = se3.make_transform(step[:3, :3] @ turn, step[:3, 3] * (1.0 + ratio))
         poses.append(poses[-1] @ longer)
     return Trajectory(np.stack(poses), truth.timestamps_s)
 
@@ -127,4 +127,4 @@ def true_loop(truth: Trajectory, first: int, last: int) -> Loop:
 @pytest.fixture(scope="module")
 def odometry(truth: Trajectory) -> Trajectory:
     """The path of a test module, as odometry would have it."""
-    return drifted(truth, share=0.01, turn_deg_per_m=0.02)
+    return drifted(truth, ratio=0.01, turn_deg_per_m=0.02)

@@ -82,7 +82,7 @@ def closed(truth) -> Closure:
 
 @pytest.mark.parametrize("wrong", [0.0, 0.1])
 def test_noise_leaves_centimetres_and_wrong_points_no_more(truth, closed, wrong):
-    odometry = drifted(truth, share=0.005, turn_deg_per_m=0.05)
+    odometry = drifted(truth, ratio=0.005, turn_deg_per_m=0.05)
     found = adjust_path(drive_path(odometry), closed, _keyframes(truth, 1, wrong), CAMERA)
     assert found is not None
     first = closed.trajectory.T_world_camera[0] @ invert(truth.T_world_camera[0])

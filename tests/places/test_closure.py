@@ -213,7 +213,7 @@ def test_a_minority_of_alike_houses_is_outvoted_and_without_a_majority_nobody_is
 
 def test_loops_to_several_laps_do_not_contradict_each_other():
     truth = circle(2.2)
-    odometry = drifted(truth, share=0.01, turn_deg_per_m=0.02)
+    odometry = drifted(truth, ratio=0.01, turn_deg_per_m=0.02)
     loops = [true_loop(truth, k + LAP * (k % 2), 2 * LAP + k) for k in range(12)]
     assert _agreeing(odometry, loops) == loops
 

@@ -27,7 +27,7 @@ BLIND = {"SHARE": 1.0, "TURN_DEG": 5.0}
 
 @pytest.mark.parametrize("drifts", [False, True])
 def test_a_drive_around_a_block_is_recognised_at_its_start(block, drifts):
-    path = drifted(block.truth, share=0.01, turn_deg_per_m=0.015) if drifts else block.truth
+    path = drifted(block.truth, ratio=0.01, turn_deg_per_m=0.015) if drifts else block.truth
     loops = block.detect([*FIRST, *AGAIN], path)[0].agreeing()
     assert len(loops) >= 5
     for loop in loops:

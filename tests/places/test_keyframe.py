@@ -142,7 +142,7 @@ def test_the_same_place_a_lap_later_is_recognised_to_centimetres(block, k):
     assert np.linalg.norm(off[:3, 3]) < 0.1
     assert np.degrees(se3.angle_rad(off)) < 0.3
     assert loop.inliers > 50
-    assert loop.dense_share > 0.9
+    assert loop.dense_ratio > 0.9
     # Off by at most four standard deviations in each direction.
     step = np.concatenate([off[:3, 3], se3.log_so3(off[:3, :3])])
     assert (np.abs(step) < 4 * np.sqrt(np.diag(np.linalg.inv(loop.information)))).all()
@@ -159,8 +159,8 @@ def test_a_place_is_recognised_from_another_distance_and_direction(block, first,
 def test_another_street_is_refused(block):
     verdict = verify(block.keyframe(3), block.keyframe(60), CAMERA)
     assert verdict.loop is None
-    share = dense_agreement(block.keyframe(3), block.keyframe(60), np.eye(4), CAMERA, CAMERA)
-    assert share < verify_file._MIN_DENSE_SHARE
+    ratio = dense_agreement(block.keyframe(3), block.keyframe(60), np.eye(4), CAMERA, CAMERA)
+    assert ratio < verify_file._MIN_DENSE_RATIO
     assert verdict.refused
 
 

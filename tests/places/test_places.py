@@ -73,10 +73,10 @@ def test_a_place_is_near_if_odometry_could_be_so_wrong():
     reach_m = REACH_M + SIGMAS * far.position_m
     turn_deg = places_file.VIEW_DEG + np.degrees(SIGMAS * far.angle_rad)
     places = Places()
-    for share in (0.0, 0.99, 1.01):
-        places.add(_place(len(places), share * reach_m, 0.0))
-    for share in (0.99, 1.01):
-        places.add(_place(len(places), 0.0, 0.0, share * turn_deg))
+    for ratio in (0.0, 0.99, 1.01):
+        places.add(_place(len(places), ratio * reach_m, 0.0))
+    for ratio in (0.99, 1.01):
+        places.add(_place(len(places), 0.0, 0.0, ratio * turn_deg))
     places.add(_place(9, 0.0, 100.0 - 0.9 * places_file._BETWEEN * REACH_M))
     places.add(_place(10, 0.0, 0.0, segment=1))
     near = places.near(_place(11, 0.0, 100.0))

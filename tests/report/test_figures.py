@@ -207,7 +207,7 @@ def test_a_figure_shows_its_picture(pair, disparity):
     assert left.max() < 40  # no match: almost black
     assert right[2] > right[0] + 60  # near: red (OpenCV decodes to BGR)
     assert [pair_page.is_wide((10, width, 3)) for width in (19, 20)] == [False, True]
-    assert [*disparity.reason_shares.items()] == [(Reason.VALID, 0.75), (Reason.BORDER, 0.25)]
+    assert [*disparity.reason_ratios.items()] == [(Reason.VALID, 0.75), (Reason.BORDER, 0.25)]
 
 
 # The second is what Teddy has; the last, a wall.
@@ -309,7 +309,7 @@ def test_depth_falls_with_disparity_as_the_camera_says(doffs_px, curves, drawn):
 
 
 def test_confidence_is_drawn_bin_by_bin_and_thin_bins_are_left_out(drawn):
-    bins = {"confidence": [0.25, 0.75], "right": [None, 0.5], "share": [0.0005, 0.9995]}
+    bins = {"confidence": [0.25, 0.75], "right": [None, 0.5], "ratio": [0.0005, 0.9995]}
     steps = {"removed": [0, 0.5], "wrong": [0.2, 0.1], "best": [0.2, 0.0]}
     curves = {"reliability": bins, "ece": 0.125, "sparsification": steps, "ause": 0.5}
     middlebury_page.reliability_figure({"sad": curves, "sgm": curves})
@@ -424,7 +424,7 @@ def test_frames_that_are_not_trusted_are_shaded(trajectory, health, drawn):
 def test_lines_of_an_audit_say_what_is_not_known():
     summary: dict[str, Any] = {
         "frames": 40, "frames_read": 10, "repeated_frames": 2, "frozen_left_frames": 0,
-        "frozen_right_frames": 3, "usual_step_s": 0.1, "gaps": 1, "swapped_share": 0.25,
+        "frozen_right_frames": 3, "usual_step_s": 0.1, "gaps": 1, "swapped_ratio": 0.25,
         "time_offset_frames": 0, "time_skew_frames": -0.001, "gain": 1.5, "sharpness_left": 0.5,
         "sharpness_right": None, "speed_m_per_s": 9.5, "focal_px": 700.0, "baseline_m": 0.5372,
         "field_of_view_deg": 80.0, "depth_error_m": {"10": 0.0312, "30": 0.0042, "90": 3.0},

@@ -153,7 +153,7 @@ def true_rows(found, A: np.ndarray, B: np.ndarray, disparity: np.ndarray) -> np.
 
 
 def shaken(size: tuple[int, int], reach: float, rng: np.random.Generator) -> np.ndarray:
-    """A homography that moves each corner by up to a share of the width."""
+    """A homography that moves each corner by up to a fraction of the width."""
     width, height = size
     border = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
     moved = border + rng.uniform(-reach, reach, (4, 2)) * width

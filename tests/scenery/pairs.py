@@ -28,7 +28,7 @@ _FOCAL = 0.86  # in image widths
 _BLUR_PX = 0.55  # of the lens, standard deviation
 _READ_DN, _SHOT_DN = 0.8, 0.013  # of the sensor: standard deviation, and variance a grey level
 _DARK_DN = 4.0  # of what is seen there, nothing is left
-_GLASS = 0.3  # share of the light that a pane reflects
+_GLASS = 0.3  # fraction of the light that a pane reflects
 _AMBIENT = 0.35  # of a room with lamps
 
 

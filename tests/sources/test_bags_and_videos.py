@@ -36,16 +36,16 @@ def fails(path: Path, message: str, settings: SourceSettings | None = None) -> N
     assert str(path) in str(caught.value) or path.name in str(caught.value)
 
 
-def halve(path: Path, share: float = 0.5) -> Path:
-    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+def halve(path: Path, ratio: float = 0.5) -> Path:
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * ratio)])
     return path
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9])
-def test_a_cut_recording_is_one_line(noise, tmp_path, kind, share):
+@pytest.mark.parametrize("ratio", [0.0, 0.001, 0.3, 0.9])
+def test_a_cut_recording_is_one_line(noise, tmp_path, kind, ratio):
     path = bag(kind=kind)(noise, CAMERA, tmp_path)
-    halve(next(path.glob("*.db3")) if kind == "ros2" else path, share)
+    halve(next(path.glob("*.db3")) if kind == "ros2" else path, ratio)
     fails(path, "recording cannot be read.*reindex")
 
 
@@ -305,15 +305,15 @@ def test_a_prior_may_be_of_the_body_or_a_file_and_nothing_else(tmp_path):
     assert (found.path.path_length_m, found.origin) == (2, str(path))
 
 
-@pytest.mark.parametrize(("write", "victim", "share", "message"), [
+@pytest.mark.parametrize(("write", "victim", "ratio", "message"), [
     (drives.write_lossy_videos, "left.mp4", 0.5, "not a readable video"),
     (drives.write_two_videos, "right.avi", 0.5, "video is truncated"),
     (drives.write_side_by_side, "both.mkv", 0.0, "not a readable video"),
     (drives.write_two_videos, "left.avi", 0.01, "video"),
 ])  # fmt: skip
-def test_a_video_that_cannot_be_read_is_one_line(noise, tmp_path, write, victim, share, message):
+def test_a_video_that_cannot_be_read_is_one_line(noise, tmp_path, write, victim, ratio, message):
     path = write(noise, CAMERA, tmp_path)
-    halve(tmp_path / victim, share)
+    halve(tmp_path / victim, ratio)
     fails(path, message)
 
 

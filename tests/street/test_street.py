@@ -460,9 +460,9 @@ def test_places_have_the_colours_of_their_material_that_they_had_before():
 
 
 @given(st.floats(-20, 20), st.floats(0.2, 5), st.floats(0.05, 0.95), st.floats(0.01, 9))
-def test_stripes_are_the_mean_over_the_footprint(x, period, share, w):
+def test_stripes_are_the_mean_over_the_footprint(x, period, ratio, w):
     fine = x + w * ((np.arange(4000) + 0.5) / 4000 - 0.5)
-    expected = ((fine % period) < share * period).mean()
-    got = materials.stripes(np.array([x]), period, share * period, np.array([w]))[0]
+    expected = ((fine % period) < ratio * period).mean()
+    got = materials.stripes(np.array([x]), period, ratio * period, np.array([w]))[0]
     # 4000 samples place each stripe's edge to w/4000; there are at most 2·(9 / 0.2 + 1) edges.
     assert got == pytest.approx(expected, abs=0.03)

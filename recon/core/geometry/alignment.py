@@ -123,17 +123,17 @@ def interpolate_poses(trajectory: Trajectory, stamps_s: Float64) -> Float64:
     after = np.minimum(after, len(times) - 1)
     before = np.maximum(after - 1, 0)
     span = np.where(times[after] > times[before], times[after] - times[before], 1.0)
-    shares = np.clip((stamps_s - times[before]) / span, 0.0, 1.0)
+    ratios = np.clip((stamps_s - times[before]) / span, 0.0, 1.0)
     poses = trajectory.T_world_camera
-    steps = zip(before, after, shares, strict=True)
-    return np.stack([pose_between(poses[i], poses[j], float(share)) for i, j, share in steps])
+    steps = zip(before, after, ratios, strict=True)
+    return np.stack([pose_between(poses[i], poses[j], float(ratio)) for i, j, ratio in steps])
 
 
-def pose_between(first: Float64, second: Float64, share: float) -> Float64:
-    """Return the pose (4, 4) at a share (0 to 1) of the way from one pose to another."""
+def pose_between(first: Float64, second: Float64, ratio: float) -> Float64:
+    """Return the pose (4, 4) at a fraction (0 to 1) of the way from one pose to another."""
     turn = log_so3(first[:3, :3].T @ second[:3, :3])
-    position = (1 - share) * first[:3, 3] + share * second[:3, 3]
-    return make_transform(first[:3, :3] @ exp_so3(share * turn), position)
+    position = (1 - ratio) * first[:3, 3] + ratio * second[:3, 3]
+    return make_transform(first[:3, :3] @ exp_so3(ratio * turn), position)
 
 
 def nearest_sorted(numbers: NDArray[Any], others: NDArray[Any]) -> Int32:

@@ -207,11 +207,11 @@ def transform_cloud(cloud: PointCloud, T: NDArray[Any], *, frame: Frame) -> Poin
     return replace(cloud, xyz=apply(T, cloud.xyz), frame=frame, **of)
 
 
-def part_of(T: Float64, share: float) -> Float64:
+def part_of(T: Float64, ratio: float) -> Float64:
     """A fraction or multiple of a motion (4, 4): rotation and translation in proportion."""
-    if share == 1.0:
+    if ratio == 1.0:
         return T
-    return make_transform(exp_so3(share * log_so3(T[:3, :3])), share * T[:3, 3])
+    return make_transform(exp_so3(ratio * log_so3(T[:3, :3])), ratio * T[:3, 3])
 
 
 _LONGEST_GAP: Final = 20.0
@@ -239,10 +239,10 @@ class Motion:
     def predict(self, timestamp_s: float) -> Float64:
         """The pose (4, 4) at a time: with constant velocity, where times are known."""
         passed_s = timestamp_s - self.timestamp_s
-        share = passed_s / self.interval_s if self.interval_s > 0.0 else 1.0
-        if not 0.0 < share <= _LONGEST_GAP:
-            share = 1.0
-        return orthonormalise(self.T_world_camera @ part_of(self.T_before_camera, share))
+        ratio = passed_s / self.interval_s if self.interval_s > 0.0 else 1.0
+        if not 0.0 < ratio <= _LONGEST_GAP:
+            ratio = 1.0
+        return orthonormalise(self.T_world_camera @ part_of(self.T_before_camera, ratio))
 
     def moved(self, T_world_camera: Float64, timestamp_s: float) -> Motion:
         """The model after a measured pose, which gives a new motion."""

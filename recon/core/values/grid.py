@@ -83,6 +83,6 @@ class OccupancyGrid(Shown):
 
     def __repr__(self) -> str:
         named = (("occupied", OCCUPIED), ("free", FREE))
-        shares = [f"{100 * np.mean(self.cells == cell):.1f} % {name}" for name, cell in named]
+        ratios = [f"{100 * np.mean(self.cells == cell):.1f} % {name}" for name, cell in named]
         size = f"{size_text(self.cells)} cells of {self.resolution_m:g} m"
-        return f"OccupancyGrid({size}, {', '.join(shares)}, origin {self.origin_m} m)"
+        return f"OccupancyGrid({size}, {', '.join(ratios)}, origin {self.origin_m} m)"

@@ -232,8 +232,8 @@ class Disparity(Shown):
         )
 
     def __repr__(self) -> str:
-        shares = (100 * kind.mean() for kind in (self.measured, self.inferred))
-        text = "{:.1f} % measured, {:.1f} % inferred".format(*shares)
+        ratios = (100 * kind.mean() for kind in (self.measured, self.inferred))
+        text = "{:.1f} % measured, {:.1f} % inferred".format(*ratios)
         return f"Disparity({size_text(self.values)}, {range_text(self.values)}{text})"
 
     @cached_property
@@ -268,8 +268,8 @@ class Disparity(Shown):
         return self.reject(self.measured, Reason.AMBIGUOUS)
 
     @property
-    def reason_shares(self) -> dict[Reason, float]:
-        """Share of the pixels, in [0, 1], for each reason that occurs; the largest first."""
+    def reason_ratios(self) -> dict[Reason, float]:
+        """Fraction of the pixels, in [0, 1], for each reason that occurs; the largest first."""
         counts = np.bincount(self.reason.ravel(), minlength=len(Reason)).tolist()
         order = sorted(Reason, key=lambda reason: -counts[reason])
         return {reason: counts[reason] / self.reason.size for reason in order if counts[reason]}

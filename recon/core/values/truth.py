@@ -58,8 +58,8 @@ class DisparityTruth:
 
     def __repr__(self) -> str:
         known, seen = (100 * float(np.mean(m)) for m in (np.isfinite(self.values), self.nonocc))
-        shares = f"{known:.1f} % known, {seen:.1f} % not occluded"
-        return f"DisparityTruth({size_text(self.values)}, {range_text(self.values)}{shares})"
+        ratios = f"{known:.1f} % known, {seen:.1f} % not occluded"
+        return f"DisparityTruth({size_text(self.values)}, {range_text(self.values)}{ratios})"
 
 
 def _seen_by_both(mask: ArrayLike, shape: tuple[int, ...]) -> Bool:
@@ -143,8 +143,8 @@ class MapMetrics:
     """Accuracy and completeness of a cloud with respect to a reference cloud."""
 
     threshold_m: float  # distance below which a point counts as correct
-    precision: float  # share of estimated points within the threshold of the reference
-    recall: float  # share of reference points within the threshold of the estimate
+    precision: float  # fraction of estimated points within the threshold of the reference
+    recall: float  # fraction of reference points within the threshold of the estimate
     f_score: float  # harmonic mean of precision and recall
     median_m: float  # median distance from estimated points to the reference
     p95_m: float  # 95th percentile of that distance
@@ -156,8 +156,10 @@ class MapMetrics:
 class VoxelMetrics:
     """Accuracy and completeness of occupied voxels."""
 
-    precision: float  # share of the occupied voxels with a true surface voxel within the tolerance
-    recall: float  # share of the true surface voxels with an occupied voxel within the tolerance
+    precision: (
+        float  # fraction of the occupied voxels with a true surface voxel within the tolerance
+    )
+    recall: float  # fraction of the true surface voxels with an occupied voxel within the tolerance
     voxels: int  # number of occupied voxels compared
     true_voxels: int  # number of true surface voxels compared
 
@@ -168,8 +170,8 @@ class GridMetrics:
 
     iou_occupied: float  # intersection over union of the occupied cells
     iou_free: float  # intersection over union of the free cells
-    occupied_called_free: float  # share of the truly occupied cells that the grid marks as free
-    unknown: float  # share of the compared cells that are unknown in the grid
+    occupied_called_free: float  # fraction of the truly occupied cells that the grid marks as free
+    unknown: float  # fraction of the compared cells that are unknown in the grid
     cells: int  # number of cells compared
     true_occupied: int  # number of those that are truly occupied
 
@@ -190,14 +192,14 @@ class OccupancyMetrics:
 class DisparityMetrics:
     """Errors of a disparity map, over the pixels whose true disparity is known."""
 
-    bad: dict[float, float]  # share of all pixels (per cent) off by more than so many (key)
-    invalid: float  # share of all pixels (per cent) without a value
+    bad: dict[float, float]  # fraction of all pixels (per cent) off by more than so many (key)
+    invalid: float  # fraction of all pixels (per cent) without a value
     avgerr_px: float  # mean absolute error of the pixels with a value
     rms_px: float  # root mean square error of the pixels with a value
     pixels: int  # number of pixels compared
     # percentiles (key) of the absolute error of pixels with a value: Middlebury's A50 to A99
     quantiles_px: dict[int, float] = field(default_factory=dict)
-    # share of all pixels (per cent) off by more than 3 pixels and 5 % of the truth: KITTI's D1
+    # fraction of all pixels (per cent) off by more than 3 pixels and 5 % of the truth: KITTI's D1
     d1: float = float("nan")
 
 
@@ -209,6 +211,6 @@ class DepthMetrics:
     median_m: float  # median absolute error of the depth
     rms_m: float  # root mean square error of the depth
     median_percent: float  # median absolute error, per cent of the true depth
-    over_5_percent: float  # share of the pixels (per cent) off by more than 5 % of the depth
-    # share of the pixels (per cent) without a finite depth: not in ``mean_m`` and ``rms_m``
+    over_5_percent: float  # fraction of the pixels (per cent) off by more than 5 % of the depth
+    # fraction of the pixels (per cent) without a finite depth: not in ``mean_m`` and ``rms_m``
     infinite: float

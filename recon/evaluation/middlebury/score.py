@@ -74,13 +74,13 @@ def score_result(scene: ScoredScene, estimate: Disparity) -> Figures:
     for kind, alone in kinds_of(estimate).items():
         compared = values_compared(alone.values, true.shape, scene.rules)
         for mask, occluded in MASKS.items():
-            figures[mask][kind] = {"share": 0.0}
+            figures[mask][kind] = {"ratio": 0.0}
             with suppress(EvaluationError):  # there is no such pixel
                 metrics = errors.evaluate_disparity(
                     compared, truth, limits_px, occluded=occluded, scale=factor, kind="measured"
                 )
-                wrong, share = metrics.bad.pop(limits_px[-1]), 100 * metrics.pixels / pixels[mask]
-                figures[mask][kind] = {"share": share, "wrong": wrong, **named_figures(metrics)}
+                wrong, ratio = metrics.bad.pop(limits_px[-1]), 100 * metrics.pixels / pixels[mask]
+                figures[mask][kind] = {"ratio": ratio, "wrong": wrong, **named_figures(metrics)}
     return figures
 
 
@@ -92,7 +92,7 @@ def kinds_of(estimate: Disparity) -> dict[errors.Kind, Disparity]:
 def named_figures(metrics: DisparityMetrics) -> Figures:
     """Return figures named as in the benchmark's table, in pixels and per cent."""
     return {
-        "bad": {f"{limit:g}": share for limit, share in metrics.bad.items()},
+        "bad": {f"{limit:g}": ratio for limit, ratio in metrics.bad.items()},
         "avgerr": metrics.avgerr_px,
         "rms": metrics.rms_px,
         **{f"a{percent}": error for percent, error in metrics.quantiles_px.items()},
@@ -120,16 +120,16 @@ def confidence_figures(estimate: Disparity, truth: DisparityTruth) -> Figures | 
         for kind, alone in kinds_of(sized).items()
         if (alone.valid & known).any()
     }
-    shares = {f"within_{n}_sigma": errors.share_within_sigma(sized, truth, n) for n in (1, 2)}
-    return {**curve_figures(sized, truth, _RIGHT_PX / step), **ece, **shares}
+    ratios = {f"within_{n}_sigma": errors.ratio_within_sigma(sized, truth, n) for n in (1, 2)}
+    return {**curve_figures(sized, truth, _RIGHT_PX / step), **ece, **ratios}
 
 
 def curve_figures(estimate: Disparity, truth: DisparityTruth, limit_px: float) -> Figures:
     """Return the same for the confidence alone, of maps of equal size."""
     bins = errors.measure_reliability(estimate, truth, limit_px)
     steps = errors.measure_sparsification(estimate, truth, limit_px)
-    share = bins.pixels / bins.pixels.sum()
-    reliability = {"confidence": bins.confidence, "right": bins.right, "share": share}
+    ratio = bins.pixels / bins.pixels.sum()
+    reliability = {"confidence": bins.confidence, "right": bins.right, "ratio": ratio}
     return {
         "ece": bins.calibration_error,
         "ause": steps.ause,
@@ -229,16 +229,16 @@ def weighted_confidence(scenes: Mapping[str, Figures | None]) -> Figures | None:
 
 
 def _pooled(scenes: Mapping[str, Figures]) -> Figures:
-    """Pool the bins of confidence with the share of each scene scaled to its weight."""
+    """Pool the bins of confidence with the fraction of each scene scaled to its weight."""
     weights, bins = _weights(scenes), scenes.values()
-    share = np.array([one["share"] for one in bins]) * (weights / weights.sum())[:, None]
-    total = share.sum(axis=0)
+    ratio = np.array([one["ratio"] for one in bins]) * (weights / weights.sum())[:, None]
+    total = ratio.sum(axis=0)
     pooled = {}
     for name in ("confidence", "right"):
         values = np.nan_to_num(np.array([one[name] for one in bins], dtype=np.float64))
         with np.errstate(invalid="ignore"):
-            pooled[name] = rounded(np.sum(share * values, axis=0) / total)
-    return {**pooled, "share": rounded(total)}
+            pooled[name] = rounded(np.sum(ratio * values, axis=0) / total)
+    return {**pooled, "ratio": rounded(total)}
 
 
 def _weights(scenes: Iterable[str]) -> Float64:

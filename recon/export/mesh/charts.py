@@ -84,13 +84,13 @@ def texels_of(atlas: Atlas) -> tuple[Int32, Int32]:
     return np.concatenate(numbers), np.concatenate(faces)
 
 
-def shares_of(atlas: Atlas, numbers: Int32, faces: Int32) -> Float32:
+def ratios_of(atlas: Atlas, numbers: Int32, faces: Int32) -> Float32:
     """Return float32 (N, 3), how much each corner of its face counts at the centre of a texel."""
     x, y, ux, uy, vx, vy, area = atlas.sides.take(faces, axis=1)
     wx, wy = numbers % atlas.width_px + 0.5 - x, numbers // atlas.width_px + 0.5 - y
     second, third = (wx * vy - wy * vx) / area, (ux * wy - uy * wx) / area
-    shares = np.stack([1 - second - third, second, third], axis=1)
-    return np.asarray(np.clip(shares, 0, 1), np.float32)
+    ratios = np.stack([1 - second - third, second, third], axis=1)
+    return np.asarray(np.clip(ratios, 0, 1), np.float32)
 
 
 def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:

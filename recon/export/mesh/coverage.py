@@ -10,14 +10,14 @@ import numpy as np
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import PointCloud, TriangleMesh
 
-# A point is covered if the mesh is no farther from it than this share of its depth.
+# A point is covered if the mesh is no farther from it than this fraction of its depth.
 COVERED_WITHIN: Final = 0.005
-LEAST_COVERAGE: Final = 0.8  # share of the points of a pair that its mesh should cover
+LEAST_COVERAGE: Final = 0.8  # fraction of the points of a pair that its mesh should cover
 _COVERAGE_SAMPLES: Final = 100_000
 
 
 def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
-    """Return the share of the points of a pair that are covered by its mesh, from 0 to 1.
+    """Return the fraction of the points of a pair that are covered by its mesh, from 0 to 1.
 
     Of more than 100,000 points, every n-th is used.
     """

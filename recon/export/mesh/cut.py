@@ -54,25 +54,25 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
     return with_faces(_with_cuts(mesh, edges, away, plane), faces.astype(np.int32))
 
 
-def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64) -> TriangleMesh:
+def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, ratio: Float64) -> TriangleMesh:
     """Add vertices (N, 3), which no face uses yet, on edges (N, 2), at shares from 0 to 1 of them.
 
     Normals and colours are interpolated along the edges.
     """
     normals, rgb = mesh.normals, mesh.rgb
     if normals is not None:
-        mixed = between(normals, edges, share)
+        mixed = between(normals, edges, ratio)
         mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-12)
         normals = np.concatenate([normals, mixed.astype(np.float32)])
     if rgb is not None:
-        rgb = np.concatenate([rgb, np.rint(between(rgb, edges, share)).astype(np.uint8)])
+        rgb = np.concatenate([rgb, np.rint(between(rgb, edges, ratio)).astype(np.uint8)])
     return TriangleMesh(np.concatenate([mesh.vertices, new]), mesh.faces, normals, rgb)
 
 
-def between(values: NDArray[Any], edges: Int32, share: Float64) -> Float64:
+def between(values: NDArray[Any], edges: Int32, ratio: Float64) -> Float64:
     """Return float64 (N, 3): vertex values (V, 3), interpolated linearly along edges."""
     first, last = values[edges[:, 0]], values[edges[:, 1]]
-    return np.asarray((1 - share[:, None]) * first + share[:, None] * last)
+    return np.asarray((1 - ratio[:, None]) * first + ratio[:, None] * last)
 
 
 def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
@@ -87,10 +87,10 @@ def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
 def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) -> TriangleMesh:
     """Return the mesh with a new vertex where each edge (E, 2) meets the plane."""
     first, last = edges.T
-    share = (away[first] / (away[first] - away[last])).astype(np.float64)
-    new = between(mesh.vertices, edges, share).astype(np.float32)
+    ratio = (away[first] / (away[first] - away[last])).astype(np.float64)
+    new = between(mesh.vertices, edges, ratio).astype(np.float32)
     new[:, plane.axis] = np.float32(plane.at_m)
-    return with_vertices(mesh, new, edges, share)
+    return with_vertices(mesh, new, edges, ratio)
 
 
 def with_faces(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
@@ -106,7 +106,7 @@ class OnEdges(NamedTuple):
     """Projections of points onto line segments."""
 
     edge: Places  # the segments
-    share: Float64  # places on them, from 0 to 1
+    ratio: Float64  # places on them, from 0 to 1
     feet: Float64  # (N, 3), the projected points
     distance_m: Float64  # of these from the points
 
@@ -146,13 +146,13 @@ def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
     along = edges[candidates, 1] - begin
     to_point = points[:, None] - begin
     length2 = np.maximum(np.einsum("nki,nki->nk", along, along), 1e-30)
-    share = np.clip(np.einsum("nki,nki->nk", to_point, along) / length2, 0, 1)
-    feet = begin + share[..., None] * along
+    ratio = np.clip(np.einsum("nki,nki->nk", to_point, along) / length2, 0, 1)
+    feet = begin + ratio[..., None] * along
     distance_m = np.linalg.norm(points[:, None] - feet, axis=2)
     best = np.argmin(distance_m, axis=1)
     row = np.arange(len(points))
     edge = candidates[row, best].astype(np.int64)
-    return OnEdges(edge, share[row, best], feet[row, best], distance_m[row, best])
+    return OnEdges(edge, ratio[row, best], feet[row, best], distance_m[row, best])
 
 
 def _with_inserted(
@@ -166,16 +166,16 @@ def _with_inserted(
     ends = mesh.vertices[corners[:, :2]]
     found = nearest_on_edges(points, ends)
     to_ends_m = np.linalg.norm(points[:, None] - ends[found.edge], axis=2).min(axis=1)
-    inside = (found.distance_m <= reach_m) & (found.share > 0) & (found.share < 1)
+    inside = (found.distance_m <= reach_m) & (found.ratio > 0) & (found.ratio < 1)
     inside &= to_ends_m > _SAME_M
     # In a triangle with two boundary edges, only the first takes new vertices.
     _, first = np.unique(corners[:, 3], return_index=True)
     inside &= np.isin(found.edge, first)
     chosen = np.flatnonzero(inside)
-    chosen = chosen[np.lexsort((found.share[chosen], found.edge[chosen]))]
+    chosen = chosen[np.lexsort((found.ratio[chosen], found.edge[chosen]))]
     new = (len(mesh.vertices) + np.arange(len(chosen))).astype(np.int32)
     edges = corners[found.edge[chosen], :2].astype(np.int32)
-    grown = with_vertices(mesh, points[chosen], edges, found.share[chosen])
+    grown = with_vertices(mesh, points[chosen], edges, found.ratio[chosen])
     return replace(grown, faces=_split_faces(mesh.faces, corners, found.edge[chosen], new))
 
 

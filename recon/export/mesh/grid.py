@@ -166,10 +166,10 @@ def _fit_planes(grid: _Grid, trust: Float64) -> _Grid:
         misfit /= sigma**2
     # Between points that a plane explains to within their noise, it holds for those missing, too.
     filled = valid | ((count > 0.5 * (2 * _RADIUS + 1) ** 2) & (misfit < 1))
-    share = np.asarray(filled / (1.0 + misfit) ** 2)
+    ratio = np.asarray(filled / (1.0 + misfit) ** 2)
     offset = mean_d - right * mean_x - down * mean_y
-    total = np.where(filled, _window(share), 1.0)
-    right, down, offset = (_window(share * k) / total for k in (right, down, offset))
+    total = np.where(filled, _window(ratio), 1.0)
+    right, down, offset = (_window(ratio * k) / total for k in (right, down, offset))
     smooth = right * x + down * y + offset
     return replace(
         grid,

@@ -190,9 +190,9 @@ class _Mesher:
         if not failed:
             return []
         worst = max(failed, key=self.points.__getitem__)
-        share = sum(self.points[key] for key in failed) / self.points.total()
+        ratio = sum(self.points[key] for key in failed) / self.points.total()
         tiles = f"{len(failed)} of {counted(len(self.points), 'tile')}"
-        return [f"no surface in {tiles}, {share:.1%} of the points ({failed[worst]})"]
+        return [f"no surface in {tiles}, {ratio:.1%} of the points ({failed[worst]})"]
 
     def _surface(self, key: PieceKey) -> TriangleMesh | MeshingError:
         """Return the surface of a piece with its margin, cut at its sides, or why there is none."""
@@ -205,7 +205,7 @@ class _Mesher:
             wrong = partial(looked_through, voxels=voxels) if len(voxels) else None
         settings, target = self.settings, self.settings.target_faces
         if target is not None:
-            # By its share of the points.
+            # By its fraction of the points.
             target = max(4, round(target * len(cloud) / self.points.total()))
             settings = settings.model_copy(update={"target_faces": target})
         else:

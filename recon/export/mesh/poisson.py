@@ -56,7 +56,7 @@ class MeshSettings(Settings):
     point_weight: float = Field(4.0, ge=0, le=1000.0)
     """Weight of the points against their normals. Lower is smoother."""
     trim_density_quantile: float = Field(0.01, ge=0, lt=1)
-    """Share of the vertices cut off as least supported; 0 keeps all."""
+    """Fraction of the vertices cut off as least supported; 0 keeps all."""
     max_distance_spacings: float | None = Field(2.0, ge=0.01, le=1000000.0)
     """Farthest a vertex may lie from the points, in local point spacings; none = keep all. Lower it
     to keep holes open."""

@@ -27,10 +27,12 @@ from recon.core.open3d_raycasting import RayScene
 from recon.core.values import RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Float32, Float64, Int32, Int64, UInt8
 from recon.core.values.camera import project
-from recon.export.mesh.charts import MARGIN_PX, Atlas, shares_of, texels_of
+from recon.export.mesh.charts import MARGIN_PX, Atlas, ratios_of, texels_of
 
 _VIEWS: Final = 3  # images that a vertex takes its colour from
-_BORDER: Final = 0.1  # share of the width of an image over which it counts less towards its border
+_BORDER: Final = (
+    0.1  # fraction of the width of an image over which it counts less towards its border
+)
 _LEAST_COSINE: Final = 0.1
 _SHARPNESS: Final = 4  # power of the scores: of images that differ, the best alone
 _DARK, _BRIGHT = 8, 247  # beyond, exposures cannot be compared
@@ -179,12 +181,12 @@ class _Texels(NamedTuple):
     """Texels of faces."""
 
     corners: Int32  # (N, 3), vertices of the face
-    shares: Float32  # (N, 3), how much each counts
+    ratios: Float32  # (N, 3), how much each counts
 
     def mean_of(self, values: Float32) -> Float32:
         """Return the values (V, C) of vertices, interpolated: float32 (N, C)."""
-        each = zip(self.shares.T, self.corners.T, strict=True)  # twice as fast as einsum
-        return reduce(np.add, (share[:, None] * values.take(corner, 0) for share, corner in each))
+        each = zip(self.ratios.T, self.corners.T, strict=True)  # twice as fast as einsum
+        return reduce(np.add, (ratio[:, None] * values.take(corner, 0) for ratio, corner in each))
 
 
 class _Canvas:
@@ -207,7 +209,7 @@ class _Canvas:
             return
         for part in np.array_split(texels, 1 + len(texels) // _AT_ONCE):
             face = self._faces[part]
-            at = _Texels(faces[face], shares_of(self._atlas, self._numbers[part], face))
+            at = _Texels(faces[face], ratios_of(self._atlas, self._numbers[part], face))
             weighted = at.mean_of(weight[:, None]) * colour_of(at)
             self._colours[part] += weighted.astype(np.float16)
 

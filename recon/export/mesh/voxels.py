@@ -14,7 +14,7 @@ from recon.export.mesh.poisson import MeshSettings, oriented, trimmed, typical_s
 from recon.map.kernels.distance import surface_of
 
 _OF_SEVENTH: Final = math.sqrt(math.pi / 7)
-"""Edge of the square that a point has for itself, as a share of the way to its seventh neighbour:
+"""Edge of the square that a point has for itself, as a fraction of the way to its seventh neighbour:
 a circle that wide holds seven."""
 
 

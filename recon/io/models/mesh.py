@@ -223,15 +223,15 @@ def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> 
 
 def srgb_from_linear(rgb: UInt8) -> UInt8:
     """Convert linear colours back to sRGB, for readers that ignore the colour space."""
-    share = rgb / 255
-    curve = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1 / 2.4) - 0.055)
+    ratio = rgb / 255
+    curve = np.where(ratio <= 0.0031308, 12.92 * ratio, 1.055 * ratio ** (1 / 2.4) - 0.055)
     return np.asarray(np.rint(curve * 255), dtype=np.uint8)
 
 
 def _linear(rgb: UInt8) -> NDArray[np.uint16]:
     """Return uint16 (V, 4): linear red, green, blue and full opacity (IEC 61966-2-1)."""
-    share = rgb / 255
-    curve = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    ratio = rgb / 255
+    curve = np.where(ratio <= 0.04045, ratio / 12.92, ((ratio + 0.055) / 1.055) ** 2.4)
     return np.asarray(np.rint(np.insert(curve, 3, 1.0, axis=1) * 65535), dtype=np.uint16)
 
 

@@ -230,9 +230,9 @@ def poses_first(
             frame = OdometryFrame(rectified, disparity, rough=True)
             found = register(frame)
             source.note_located(index)
-            valid_share = float(np.mean(disparity.measured))
+            valid_ratio = float(np.mean(disparity.measured))
             T = found.T_world_camera
-            yield FrameResult(index, len(source), 0.0, valid_share, 0, T, found.health)
+            yield FrameResult(index, len(source), 0.0, valid_ratio, 0, T, found.health)
             behind.add((rectified, found))
             if tracks is not None:
                 tracks.add(index, frame, found)

@@ -25,7 +25,7 @@ from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 from recon.stereo.rectify.rectifier import turns_of
 
-_KNOWN: Final = PriorSettings(sigma_share=0.01)
+_KNOWN: Final = PriorSettings(sigma_ratio=0.01)
 """How well poses are expected to be known; only where they are much worse is it said."""
 
 

@@ -91,9 +91,9 @@ class Mapper:
         work = (builder, len(self), cloud, rays, T_world_camera)
         self._behind.begin(partial(self._integrate, *work))
         self.session.add_frame(T_world_camera, frame.pair.timestamp_s, health)
-        valid_share = float(np.mean(frame.disparity.measured))
+        valid_ratio = float(np.mean(frame.disparity.measured))
         found = (len(frame.cloud), T_world_camera, health, segment)
-        return FrameResult(len(self) - 1, total, 0.0, valid_share, *found)
+        return FrameResult(len(self) - 1, total, 0.0, valid_ratio, *found)
 
     def _integrate(
         self,
@@ -259,7 +259,7 @@ class FrameResult:
     index: int  # position in the run, from 0
     total: int  # number of frames in the run
     seconds: float  # time since the previous frame was done
-    valid_share: float  # share of pixels with a disparity, in [0, 1]
+    valid_ratio: float  # fraction of pixels with a disparity, in [0, 1]
     points: int  # number of points in the cloud of the frame
     T_world_camera: Float64  # (4, 4)
     health: OdometryHealth
@@ -280,7 +280,7 @@ class FrameResult:
             "index": self.index,
             "total": self.total,
             "seconds": round(self.seconds, 4),
-            "valid_share": _finite(self.valid_share),
+            "valid_ratio": _finite(self.valid_ratio),
             "points": self.points,
             "position_m": [_finite(x) for x in self.T_world_camera[:3, 3].tolist()],
             "measured": self.health.ok,
@@ -290,9 +290,9 @@ class FrameResult:
 
     @property
     def state(self) -> str:
-        """The frame for people: share of valid pixels, and whether the pose is trusted."""
+        """The frame for people: fraction of valid pixels, and whether the pose is trusted."""
         pose = counted(self.health.inliers, "inlier") if self.ok else "pose not trusted"
-        return f"{100 * self.valid_share:.0f} % valid, {pose}"
+        return f"{100 * self.valid_ratio:.0f} % valid, {pose}"
 
 
 def _finite(value: float) -> float | None:

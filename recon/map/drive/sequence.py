@@ -349,13 +349,13 @@ def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
 
 
 def _depths(disparity: Disparity, camera: RectifiedCamera) -> str:
-    """Return the share of pixels with a match, and their depths."""
-    share = f"{100 * float(disparity.measured.mean()):.1f} % of the pixels matched"
+    """Return the fraction of pixels with a match, and their depths."""
+    ratio = f"{100 * float(disparity.measured.mean()):.1f} % of the pixels matched"
     if not disparity.measured.any():
-        return share
+        return ratio
     depth_m = depth_from_disparity(disparity.values[disparity.measured], camera)
     low, high = np.nanpercentile(depth_m, [5, 95])
-    return f"{share}, at {low:.3g} to {high:.3g} m"
+    return f"{ratio}, at {low:.3g} to {high:.3g} m"
 
 
 def _limits(settings: CloudSettings) -> str:

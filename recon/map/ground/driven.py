@@ -20,7 +20,7 @@ from recon.map.ground.surface import GroundSurface
 _SAME_M: Final = 0.3
 """Heights of the camera above the ground that differ by less are those of one vehicle."""
 _STEADY: Final = 0.8
-"""Share of the path on which the height is the same, if something carries the camera."""
+"""Fraction of the path on which the height is the same, if something carries the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +45,8 @@ class DrivenPath:
         steps = np.where(joined, np.ceil(length_m / step_m), 1).astype(np.int64).clip(min=1)
         end = np.repeat(np.arange(1, len(path_m)), steps)
         left = np.repeat(np.cumsum(steps), steps) - np.arange(1, steps.sum() + 1)
-        share = (left / np.repeat(steps, steps))[:, None]
-        between = share * path_m[end - 1] + (1 - share) * path_m[end]
+        ratio = (left / np.repeat(steps, steps))[:, None]
+        between = ratio * path_m[end - 1] + (1 - ratio) * path_m[end]
         keep = np.append(trusted[0], trusted[end])
         points = np.concatenate([path_m[:1], between])
         return cls(points[keep], np.append(submap[0], submap[end])[keep])

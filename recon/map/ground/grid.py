@@ -18,7 +18,7 @@ from recon.map.ground.surface import WINDOW_M, GroundSurface
 JOINED_CELLS: Final = 2
 """Cells that were hit, but not surely, belong to an obstacle that they hang together with over so
 many cells, unless they touch a free one."""
-SMEAR_SHARE: Final = 1 / 8
+SMEAR_RATIO: Final = 1 / 8
 """Of the voxels of a column within so many cells, in a column that shows where hits of that one
 scatter, and no obstacle of its own."""
 FREE_HEIGHT_M: Final = 0.8
@@ -75,7 +75,7 @@ def flatten(
     free = (number_in(empty & low_air) > 0) & ~blocked & ~(hit_low & _beside(blocked))
     seen = number_in(empty & (height >= 0)) > 0
     unsure = (number_in(hit) > 0) & seen & ~blocked & ~free & ~_beside(free)
-    blocked &= solid >= SMEAR_SHARE * _largest_around(solid)
+    blocked &= solid >= SMEAR_RATIO * _largest_around(solid)
     for _ in range(JOINED_CELLS):
         blocked |= unsure & _beside(blocked)
     cells = np.where(free, np.int8(FREE), np.int8(UNKNOWN))

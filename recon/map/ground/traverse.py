@@ -61,8 +61,8 @@ class RobotSettings(Settings):
     @property
     def step_m(self) -> float:
         """The highest step."""
-        share = 2 * FRICTION**2 / (1 + FRICTION**2)
-        return share * self.wheel_radius_m if self.max_step_m is None else self.max_step_m
+        ratio = 2 * FRICTION**2 / (1 + FRICTION**2)
+        return ratio * self.wheel_radius_m if self.max_step_m is None else self.max_step_m
 
 
 class Raster(NamedTuple):

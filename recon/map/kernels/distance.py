@@ -230,11 +230,11 @@ def _place_vertices(grid: Grid, in_cells: Sheets, vertices: Float64) -> None:
                 continue
             begin, end = _CORNERS[_EDGES[e, 0]], _CORNERS[_EDGES[e, 1]]
             d, f = distance[_row_at(grid, n, begin, 1)], distance[_row_at(grid, n, end, 1)]
-            vertex, share = first[n] + sheet, d / (d - f)
+            vertex, ratio = first[n] + sheet, d / (d - f)
             number[vertex] += 1
             cell = unpack_key(grid[1][n])
             for axis in range(3):
-                place = cell[axis] + begin[axis] + share * (end[axis] - begin[axis])
+                place = cell[axis] + begin[axis] + ratio * (end[axis] - begin[axis])
                 vertices[vertex, axis] += (place - vertices[vertex, axis]) / number[vertex]
 
 

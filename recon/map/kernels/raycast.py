@@ -2,7 +2,7 @@
 
 The evidence of one frame is collected first, so that a thousand rays through a cell count once and
 a hit outweighs every miss; then `recon.map.kernels.clamped` adds the frame to the log-odds. A
-measurement is a normal distribution along its ray: a cell is hit by the share of the distribution
+measurement is a normal distribution along its ray: a cell is hit by the fraction of the distribution
 that lies in it, and only what lies well before it is free. All lengths are in cells, except those
 of the points given. Reference implementations: `tests/map/kernels/reference.py`.
 
@@ -165,7 +165,7 @@ def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
     """Collect the evidence of the rays of one frame; return the stores that hold it.
 
     The cells that a ray leaves before its length reaches ``free`` are missed. Where it hits, the
-    cells that touch ``length ± spread·sigma`` get ``hit`` times the share of the normal
+    cells that touch ``length ± spread·sigma`` get ``hit`` times the fraction of the normal
     distribution between the ray's entry and exit. Of several hits the largest counts, of several
     misses the strongest, and a hit outweighs misses; so the order of rays is irrelevant. A ray of
     zero length says nothing.
@@ -294,7 +294,7 @@ def _axis(origin: float, direction: float, cell: int) -> tuple[int, float, float
 
 @kernel
 def _normal_cdf(value: float, mean: float, sigma: float) -> float:
-    """Share of a normal distribution below ``value``; a step where ``sigma`` is 0."""
+    """Fraction of a normal distribution below ``value``; a step where ``sigma`` is 0."""
     if sigma <= 0:
         return 1.0 if value > mean else 0.0
     return 0.5 * (1.0 + math.erf((value - mean) / (sigma * _SQRT2)))

@@ -11,11 +11,13 @@ from recon.core.kernels.voxels import pack_keys
 from recon.core.values.arrays import Bool, Float64, Int64
 
 MIN_POINTS = 10  # least number of points in a cell with a surface
-THIN_SHARE = 0.1
-"""A cell is thin along an axis where its points spread by less than this share of its edge.
+THIN_RATIO = 0.1
+"""A cell is thin along an axis where its points spread by less than this fraction of its edge.
 
 Points that fill a cell evenly spread by 0.29 of its edge (1/√12)."""
-NOISE = 0.02  # standard deviation that is added to that of every surface, as a share of that edge
+NOISE = (
+    0.02  # standard deviation that is added to that of every surface, as a fraction of that edge
+)
 FAR_CHI2 = 9.0
 """Points three standard deviations from the surface of their cell count like those without one."""
 
@@ -36,7 +38,7 @@ class Surfaces:
 class Fit:
     """How points fit surfaces."""
 
-    overlap: float  # share of points that lie in a cell of the map
+    overlap: float  # fraction of points that lie in a cell of the map
     residual_m: float  # median distance of points to the surface of their cell; NaN = no surface
     # float64 (6, 6), of a step (translation in metres, rotation vector in radians) of their frame
     information: Float64
@@ -85,7 +87,7 @@ def misfit(xyz: Float64, surfaces: Surfaces) -> float:
 def _thin_information(covariance: Float64, edge_m: float) -> Float64:
     """Return the inverse covariance (M, 3, 3) along the thin axes, zero along the others."""
     spread, axes = np.linalg.eigh(covariance)
-    thin = np.sqrt(np.maximum(spread, 0.0)) < THIN_SHARE * edge_m
+    thin = np.sqrt(np.maximum(spread, 0.0)) < THIN_RATIO * edge_m
     strength = np.where(thin, 1.0 / (np.maximum(spread, 0.0) + (NOISE * edge_m) ** 2), 0.0)
     information: Float64 = np.einsum("mik,mk,mjk->mij", axes, strength, axes)
     return information

@@ -98,8 +98,8 @@ class Surroundings:
         correction = replace(measured, step=measured.step - self._offset)
         if learn:
             self._measured += 1
-            share = 1.0 / min(self._measured, _OFFSET_FRAMES)
-            self._offset = (1.0 - share) * self._offset + share * measured.step
+            ratio = 1.0 / min(self._measured, _OFFSET_FRAMES)
+            self._offset = (1.0 - ratio) * self._offset + ratio * measured.step
         if not is_worthwhile(correction, belief.covariance):
             return None
         T = belief.T_world_camera @ as_transform(correction.step)
@@ -171,12 +171,12 @@ def _fit(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -> Fi
     return replace(fit, information=turn.T @ fit.information @ turn)
 
 
-_MIN_OVERLAP: Final = 0.5  # least share of points that lie in a cell of the map
+_MIN_OVERLAP: Final = 0.5  # least fraction of points that lie in a cell of the map
 _MIN_RESIDUAL_GAIN: Final = 0.02  # least relative decrease of the median residual
-_MIN_SHARE: Final = 0.1
+_MIN_RATIO: Final = 0.1
 """Least Kalman gain, in the direction in which it is largest: with less, ICP knows no more than the
 prior."""
-_ICP_INDEPENDENCE: Final = 0.05  # share of the points whose errors count as independent
+_ICP_INDEPENDENCE: Final = 0.05  # fraction of the points whose errors count as independent
 _MIN_CONTRAST: Final = 2.0 * math.log(1000.0)
 """Chi-square by which any pose that is wrong must fit worse: it is a thousand times less likely."""
 _ICP_FLOOR: Final = 0.02
@@ -209,7 +209,7 @@ def is_worthwhile(correction: Correction, prior_covariance: Float64) -> bool:
         return False
     both = prior_covariance + icp_covariance(after)
     likely = distance_in_sigmas(step, both) <= MAX_SIGMAS
-    return after.overlap >= _MIN_OVERLAP and likely and _gain(prior_covariance, both) >= _MIN_SHARE
+    return after.overlap >= _MIN_OVERLAP and likely and _gain(prior_covariance, both) >= _MIN_RATIO
 
 
 def icp_covariance(fit: Fit) -> Float64:

@@ -95,8 +95,8 @@ class Reaches:
 def still_there(keys: Int64, reach: Float64, occupied: Int64) -> Bool:
     """Return bool (N,), packed cells with one of the sorted occupied ones in reach (N, 3) cells."""
     places, found = unpack_keys(keys) + 0.5, find_keys(keys, occupied)[1]
-    for share in np.linspace(0, 1, math.ceil(2 * np.abs(reach).max(initial=0)) + 1)[1:]:
-        for sign in (-share, share):
+    for ratio in np.linspace(0, 1, math.ceil(2 * np.abs(reach).max(initial=0)) + 1)[1:]:
+        for sign in (-ratio, ratio):
             cells = np.floor(places + sign * reach).astype(np.int64)
             found |= find_keys(pack_keys(cells), occupied)[1]
     return np.asarray(found)

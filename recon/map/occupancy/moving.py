@@ -58,7 +58,7 @@ _PLACED: Final = 0.45
 _UNSURE: Final = _MOST / 2
 """Largest mean evidence around a voxel that may be of what moved beside it."""
 _MUCH: Final = 0.02
-"""Share of the points of a tile from which error is likelier to be underrated than all to move."""
+"""Fraction of the points of a tile from which error is likelier to be underrated than all to move."""
 _SIGMAS: Final = (FREE_MARGIN_SIGMAS, 2 * FREE_MARGIN_SIGMAS)
 """Standard deviations that a body must have moved by; the second where so much would go."""
 _INSIDE: Final = 8  # voxels that touch one inside a surface

@@ -17,7 +17,7 @@ from recon.places.places import SIGMAS
 _LARGEST_S: Final = 5.0  # clocks that differ by more are of another recording, or time zone
 _STEP_S: Final = 0.25
 _MOST_TRIED: Final = 20_000
-_KEPT: Final = 0.75  # share of the positions that a fit is judged by: others may jump
+_KEPT: Final = 0.75  # fraction of the positions that a fit is judged by: others may jump
 _ROUNDS: Final = 3
 _FEWEST: Final = 8
 _NUDGE_S: Final = 0.05

@@ -32,7 +32,9 @@ from recon.places.fixes import Fixes
 from recon.places.places import RECEIVER_M, SIGMAS, drift_at_end, fit_to_path
 from recon.sources.bag_positions import read_measured
 
-LARGEST_MISFIT: Final = 0.01  # misfit, as a share of the extent of the path, that drift may explain
+LARGEST_MISFIT: Final = (
+    0.01  # misfit, as a fraction of the extent of the path, that drift may explain
+)
 _LONGEST_ARM_M: Final = 100.0
 """The axes of a vehicle are known to a degree or so: an antenna farther away is off by metres."""
 LEVEL_RAD: Final = np.radians(3.0)

@@ -88,13 +88,13 @@ def place_map_on(
     folder.mkdir(parents=True, exist_ok=True)
     while tiles is None:
         halvings += 1
-        shares = _shares(range(len(placed)), workers)
-        parts = [folder / f"submaps-{halvings}-{n}" for n in range(len(shares))]
-        each(partial(_cut_submaps, file, settings, halvings), [*zip(shares, parts, strict=True)])
+        batches = _batches(range(len(placed)), workers)
+        parts = [folder / f"submaps-{halvings}-{n}" for n in range(len(batches))]
+        each(partial(_cut_submaps, file, settings, halvings), [*zip(batches, parts, strict=True)])
         axes, drives = map_.first.T_map_world, placed.drives
         taken = partial(Tiles.of_files, parts, settings, axes, halvings=halvings, drives=drives)
         tiles = taken()
-    groups = _shares([tile.key for tile in tiles], workers)
+    groups = _batches([tile.key for tile in tiles], workers)
     files = [folder / f"tiles-{n}" for n in range(len(groups))]
     each(partial(_make_tiles, file, settings, taken), [*zip(groups, files, strict=True)])
     tiles.adopt(files)
@@ -122,7 +122,7 @@ class PlacedSubmaps:
         self._apart = [_without_place(map_, session) for session in sessions]
         self.drives = [len(session.submaps) for session in sessions]
         self.corrections = sessions[0].corrections() if alone else None
-        self._parts = (
+        self._batches = (
             [(sessions[0].submaps if self.ready else CastSubmaps(sessions[0], settings), None)]
             if alone
             else [_beside(map_, session, settings) for session in sessions]
@@ -139,7 +139,7 @@ class PlacedSubmaps:
         """Return a submap by its number among those of all drives."""
         drive = int(np.searchsorted(np.cumsum(self.drives), number, side="right"))
         own = number - sum(self.drives[:drive])
-        submaps, T = self._parts[drive]
+        submaps, T = self._batches[drive]
         submap = submaps[own]
         frames = range(submap.first_frame, submap.first_frame + submap.frames)
         if not self._apart[drive].isdisjoint(frames):
@@ -236,8 +236,8 @@ def _with_gaps(parts: Sequence[np.ndarray], gap: float) -> np.ndarray:
     return np.concatenate(rows)
 
 
-def _shares(items: Sequence[Any], workers: int) -> list[Any]:
-    """Return items in shares of neighbours, several for each process."""
+def _batches(items: Sequence[Any], workers: int) -> list[Any]:
+    """Return items in fractions of neighbours, several for each process."""
     count = max(1, min(len(items), _SHARE * workers))
     ends = [len(items) * n // count for n in range(count + 1)]
     return [items[a:b] for a, b in pairwise(ends)]

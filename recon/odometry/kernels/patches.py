@@ -23,7 +23,7 @@ LEAST_POWER: Final = 1.0
 """Least mean squared deviation of the grey values of a patch from their mean."""
 
 _FLAT: Final = 1e-9
-"""Share of the squared gradients below which a patch has gradients in one direction alone."""
+"""Fraction of the squared gradients below which a patch has gradients in one direction alone."""
 
 
 class Placing(NamedTuple):

@@ -236,8 +236,8 @@ def find_features(image: UInt8, most: float) -> tuple[Float32, UInt8]:
         (width, height), size
     )
     shapes = [(point.size / 2.0 / zoom, math.radians(point.angle)) for point in keypoints]
-    shares = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1.0)
-    root = np.rint(512.0 * np.sqrt(shares)).clip(0, 255)
+    ratios = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1.0)
+    root = np.rint(512.0 * np.sqrt(ratios)).clip(0, 255)
     return np.hstack([uv, shapes]).astype(np.float32), root.astype(np.uint8)
 
 

@@ -36,7 +36,7 @@ _SMALL_PX: Final = 80  # frames are compared at this width, at which sensor nois
 # A frame is still if it changes no more than this multiple of the stillest tenth of all frames, or
 # than this many grey levels, which is what remains of noise at that size.
 _STILL: Final = 2.0
-_STILL_SHARE: Final = 0.1
+_STILL_RATIO: Final = 0.1
 _NOISE_DN: Final = 0.5
 _MOST: Final = 120  # frames that are taken at most; some of them will not show the board
 
@@ -184,7 +184,7 @@ def _shrunk(both: tuple[UInt8, UInt8]) -> Float32:
 def _choose(small: Float32) -> list[int]:
     """Return indices of still frames, each as different as can be from those chosen before it."""
     steps = _apart(small[1:], small[:-1])
-    limit = max(_NOISE_DN, _STILL * float(np.quantile(steps, _STILL_SHARE))) if len(steps) else 0.0
+    limit = max(_NOISE_DN, _STILL * float(np.quantile(steps, _STILL_RATIO))) if len(steps) else 0.0
     calm = steps <= limit  # nothing moves before a still frame, nor after it
     still = np.flatnonzero(np.concatenate([calm[:1], calm[:-1] & calm[1:], calm[-1:]]))
     if not len(still):

@@ -102,7 +102,7 @@ def _summarise(
         "coverage_left": _coverage([view.seen[0].pixels for view in fit.views], rig.left),
         "coverage_right": _coverage([view.seen[1].pixels for view in fit.views], rig.right),
         "tilt_max_deg": float(tilts_deg.max()),
-        "tilted_share": float((tilts_deg >= TILT_DEG).mean()),
+        "tilted_ratio": float((tilts_deg >= TILT_DEG).mean()),
         "far_to_near": float(away_m.max() / away_m.min()),
         "depth_error_cm": {
             f"{each.depth_m:g}": {k: plain(100.0 * getattr(each, f"{k}_m")) for k in _DEPTH_CM}
@@ -110,8 +110,8 @@ def _summarise(
         },
         "working_error": {
             "distance_m": spread.working.depth_m,
-            "calibration_share": plain(spread.working.calibration_m / spread.working.depth_m),
-            "matching_share": spread.working.matching_m / spread.working.depth_m,
+            "calibration_ratio": plain(spread.working.calibration_m / spread.working.depth_m),
+            "matching_ratio": spread.working.matching_m / spread.working.depth_m,
         },
     }
 
@@ -124,7 +124,7 @@ def shared_pixels(view: View) -> tuple[Float64, Float64]:
 
 
 def _coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
-    """Return the share of image cells in which a corner was seen, in [0, 1]."""
+    """Return the fraction of image cells in which a corner was seen, in [0, 1]."""
     size = np.array([camera.width_px, camera.height_px])
     cells = np.floor((np.concatenate(pixels) + 0.5) / size * _CELLS).astype(int)
     inside = np.clip(cells, 0, np.array(_CELLS) - 1)
@@ -143,8 +143,8 @@ def _distances_m(fit: StereoFit) -> Float64:
 def describe_depths(summary: dict[str, Any]) -> dict[str, str]:
     """Return the depth errors of a summary as text, one line per distance."""
     working = summary["working_error"]
-    share = working["calibration_share"]
-    text = "unknown" if share is None else f"{100 * share:.1f} %"
+    ratio = working["calibration_ratio"]
+    text = "unknown" if ratio is None else f"{100 * ratio:.1f} %"
     lines = {f"depth error at the working distance of {working['distance_m']:.3g} m": text}
     for depth, cm in summary["depth_error_cm"].items():
         known = "no common view"

@@ -92,9 +92,9 @@ def judge_calibration(
             for code, own in found
         ]
 
-    share = summary["working_error"]["calibration_share"]
+    ratio = summary["working_error"]["calibration_ratio"]
     found = described(
-        "fatal" if share is None or share > _USABLE else "warning", _depth_faults(board, summary)
+        "fatal" if ratio is None or ratio > _USABLE else "warning", _depth_faults(board, summary)
     )
     found += described("warning", _doubts(board, summary))
     lacking: list[CalibrationFinding] = []
@@ -106,22 +106,22 @@ def judge_calibration(
 
 def _depth_faults(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
     expected = summary["working_error"]
-    distance_m, share = expected["distance_m"], expected["calibration_share"]
+    distance_m, ratio = expected["distance_m"], expected["calibration_ratio"]
     at = _length(distance_m, board)
-    if share is None:
+    if ratio is None:
         yield "overlap", {"at": at}
-    elif share > _GOOD:
-        wrong = _length(share * distance_m, board)
-        yield "depth", {"at": at, "wrong": wrong, "percent": 100 * share}
+    elif ratio > _GOOD:
+        wrong = _length(ratio * distance_m, board)
+        yield "depth", {"at": at, "wrong": wrong, "percent": 100 * ratio}
 
 
 def _doubts(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
     if summary["views_used"] < _FEW_VIEWS:
         yield "views", {"views": counted(summary["views_used"], "different view")}
     for side in ("left", "right"):
-        share = summary[f"coverage_{side}"]
-        if share < _SMALL_COVERAGE:
-            yield "coverage", {"percent": 100 * share, "side": side}
+        ratio = summary[f"coverage_{side}"]
+        if ratio < _SMALL_COVERAGE:
+            yield "coverage", {"percent": 100 * ratio, "side": side}
     if summary["stereo_rms_px"] > _APART * max(summary["left_rms_px"], summary["right_rms_px"]):
         yield "together", {}
     if summary["epipolar_95_px"] > _ROWS_PX:
@@ -149,11 +149,11 @@ def _left_out(board: CalibrationBoard, images: ImagePairs, summary: dict[str, An
 
 
 def _lacks(summary: dict[str, Any]) -> Found:
-    side, share = min((summary[f"coverage_{side}"], side) for side in ("left", "right"))[::-1]
-    if _SMALL_COVERAGE <= share < _COVERED:
-        yield "corners", {"percent": 100 * share, "side": side}
-    if summary["tilted_share"] < _TILTED:
-        yield "tilt", {"percent": 100 * summary["tilted_share"]}
+    side, ratio = min((summary[f"coverage_{side}"], side) for side in ("left", "right"))[::-1]
+    if _SMALL_COVERAGE <= ratio < _COVERED:
+        yield "corners", {"percent": 100 * ratio, "side": side}
+    if summary["tilted_ratio"] < _TILTED:
+        yield "tilt", {"percent": 100 * summary["tilted_ratio"]}
     low, high = summary["focal_interval_px"]
     if high - low > 2 * _UNSURE_FOCAL * summary["focal_px"]:
         yield "focal", {"low": low, "high": high}

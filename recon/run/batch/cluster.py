@@ -64,7 +64,7 @@ class BatchOptions:
         return local_cluster(self.workers or available_cores())
 
     def threads_of(self, threads: int | None) -> int | None:
-        """Return the threads of a job, by default a share of the cores of this machine."""
+        """Return the threads of a job, by default a fraction of the cores of this machine."""
         if threads is not None or self.scheduler is not None:
             return threads
         return max(1, available_cores() // (self.workers or available_cores()))

@@ -35,8 +35,8 @@ _SUMMARY_BYTES: Final = 1 << 26
 _LEAST_JOBS: Final = 4  # fewer of one kind have no usual value
 #: The spread of a normal distribution from its median absolute deviation.
 _SIGMAS: Final = 1.4826
-#: Smallest spread, as a share of the median.
-_LEAST_SHARE: Final = 0.1
+#: Smallest spread, as a fraction of the median.
+_LEAST_RATIO: Final = 0.1
 _UNUSUAL: Final = 3.5
 """Standard deviations from which a figure is unusual: 0.05 % of normal ones are."""
 
@@ -194,5 +194,5 @@ def _far(name: str, values: Sequence[float]) -> list[float]:
     """Return by how many standard deviations figures are worse than their median."""
     least, median = _LEAST_SPREAD[name.rpartition(".")[2]], statistics.median(values)
     spread = _SIGMAS * statistics.median(abs(value - median) for value in values)
-    spread = math.copysign(max(spread, _LEAST_SHARE * abs(median), abs(least)), least)
+    spread = math.copysign(max(spread, _LEAST_RATIO * abs(median), abs(least)), least)
     return [(value - median) / spread for value in values]

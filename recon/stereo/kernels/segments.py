@@ -45,11 +45,11 @@ def fit_segments(
     first: int,
     end: int,
     planes: Float32,
-    shares: Float32,
+    ratios: Float32,
 ) -> None:
     """Give the pixels of some of the segments ``wanted`` their plane, float32 (3, H, W).
 
-    ``shares``, float32 (H, W), gets which share of all pixels of the segment lie on it.
+    ``shares``, float32 (H, W), gets which fraction of all pixels of the segment lie on it.
 
     ``values`` and ``weights`` are float32 (H, W), NaN = unknown; pixels that are farther than
     ``within_px`` from a plane do not count. ``draws``, float64 (T, 3), from 0 to 1, says through
@@ -82,12 +82,12 @@ def fit_segments(
         value, across, down = plane
         if left < _LEAST or max(abs(across), abs(down)) > STEEPEST:
             continue
-        share = np.float32(known * left / (count * (stop - begin)))
+        ratio = np.float32(known * left / (count * (stop - begin)))
         for i in range(begin, stop):
             y, x = order[i] // width, order[i] % width
             planes[0, y, x] = value + across * x + down * y
             planes[1, y, x], planes[2, y, x] = across, down
-            shares[y, x] = share
+            ratios[y, x] = ratio
 
 
 @kernel

@@ -56,7 +56,7 @@ def take_votes(
     end: int,
     own: Float32,
 ) -> None:
-    """Write which share of the votes is for the disparity of each marked pixel of some rows.
+    """Write which fraction of the votes is for the disparity of each marked pixel of some rows.
 
     The pixels around it vote by how alike they are: ``alike``, float32 (256,), is the weight of a
     difference of grey levels. ``own``, float32 (H, W), is negative where a nearer or a farther
@@ -84,5 +84,5 @@ def take_votes(
                         farther += weight
                     else:
                         same += weight
-            share = same / (nearer + same + farther)
-            own[y, x] = share if same >= max(nearer, farther) else share - np.float32(1)
+            ratio = same / (nearer + same + farther)
+            own[y, x] = ratio if same >= max(nearer, farther) else ratio - np.float32(1)

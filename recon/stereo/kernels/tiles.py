@@ -29,8 +29,8 @@ class Support(NamedTuple):
     margin_x: int  # columns beside a tile whose matches count too, pixels at full size
     margin_y: int  # rows above and below a tile whose matches count too, pixels at full size
     margin: int  # a match supports candidates up to this far from it
-    matched: float  # least share of matched pixels; with fewer, all candidates are offered
-    share: float  # least share of the matches that support an offered group
+    matched: float  # least fraction of matched pixels; with fewer, all candidates are offered
+    ratio: float  # least fraction of the matches that support an offered group
     least: int  # least number of matches that support an offered group
 
 
@@ -57,7 +57,7 @@ def offer_supported(
             x0, x1 = _reach(j, tiles.width, support.margin_x, halved.shape[1])
             counts[:] = 0
             matched = _count(halved[y0:y1, x0:x1], minimum, counts)
-            least = max(support.share * matched, support.least)
+            least = max(support.ratio * matched, support.least)
             everything = matched < support.matched * (y1 - y0) * (x1 - x0)
             for group in range(groups):
                 first = max(group * GROUP - support.margin, 0)

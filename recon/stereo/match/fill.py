@@ -31,7 +31,7 @@ _TRUSTED: Final = 0.7  # from this confidence on it speaks for or against a plan
 _CLIPPED_PX: Final = 5  # edge of the square whose mean is black or white
 _CLIPPED_LEVELS: Final = 4  # grey levels that noise adds to black
 _WIDEST_GAP: Final = 3  # neighbouring directions without support: less than a half-plane
-_LEAST_SHARE: Final = 0.3  # of a segment that lies on its plane, unless it is supported all around
+_LEAST_RATIO: Final = 0.3  # of a segment that lies on its plane, unless it is supported all around
 # Of what such planes led to on MiddEval3, dmb4, the yard and rendered scenes, so much was right.
 _CONFIDENCE: Final = 0.88
 _AROUND_PX: Final = 30  # half the square whose disparities a filled one may be any of
@@ -74,14 +74,14 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
     unseen = beyond_range(seen) | clipped | (seen.reason == np.uint8(Reason.BORDER))
     filled, values = np.zeros_like(sure), seen.values.copy()
     with ThreadPoolExecutor(threads) as pool:
-        shares = fit_segments(smooth_colours(pair), trusted, planes, pool, threads)
+        ratios = fit_segments(smooth_colours(pair), trusted, planes, pool, threads)
         distances = _distances(trusted.measured, pool)
-        for plane, share in zip(planes, shares, strict=True):  # the smallest segments first
+        for plane, ratio in zip(planes, ratios, strict=True):  # the smallest segments first
             wanted = ~(sure | filled | unseen | outside(plane[0]))
             support = np.empty((3, *sure.shape), np.uint8)
             weigh = partial(_weigh, seen.values, distances, plane, wanted, support)
             common.in_strips(pool, threads, weigh, len(sure))
-            taken = (share >= _LEAST_SHARE) & (support[2] <= _WIDEST_GAP) & (support[1] == 0)
+            taken = (ratio >= _LEAST_RATIO) & (support[2] <= _WIDEST_GAP) & (support[1] == 0)
             taken |= support[0] == kernels.DIRECTIONS
             values[taken] = plane[0][taken]
             filled |= taken

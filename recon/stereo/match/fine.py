@@ -45,7 +45,7 @@ _LARGEST_LEARNED: Final = 17.0
 _LARGEST: Final = _LARGEST_LEARNED + sgm.LARGEST_COST
 _P1, _P2 = 16.0, 58.0  # penalties of paths from disparity to disparity
 _PER_PX, _MOST = 50.0, 140.0  # and from plane to plane
-_EDGE_SHARE: Final = 0.15  # of the latter that is left where the image has an edge
+_EDGE_RATIO: Final = 0.15  # of the latter that is left where the image has an edge
 _RADIUS: Final = 1  # of windows; planes do what larger ones do
 _LEVELS: Final = sgm.LEVELS / (_LARGEST + _P2)  # steps of a cost in a byte
 _WINDOW: Final = scaled_window(
@@ -152,7 +152,7 @@ def _changes(minimum: int) -> kernels.Changes:
     return kernels.Changes(
         per_px=_PER_PX * _LEVELS,
         most=_MOST * _LEVELS,
-        most_at_edge=_EDGE_SHARE * _MOST * _LEVELS,
+        most_at_edge=_EDGE_RATIO * _MOST * _LEVELS,
         edge=sgm.EDGE_GREY_LEVELS,
         outside=float(sgm.LEVELS),
         minimum=minimum,

@@ -45,7 +45,7 @@ LEAST_NDISP: Final = 32  # with fewer candidates a search at half size takes lon
 TILE_HEIGHT_PX: Final = 16
 _TILE_COLUMNS: Final = 160  # columns of a tile together with those that its windows reach over
 # How much support at half size offers candidates to a tile.
-SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, share=0.03, least=4)
+SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, ratio=0.03, least=4)
 
 
 class SadSettings(common.MeasuredSettings, common.FillableSettings):

@@ -35,11 +35,11 @@ def fit_segments(
     """Write the planes of the pixels in segments that have one, (SEGMENTATIONS, 3, H, W).
 
     ``guide``, uint8 (H, W, 3), are smoothed colours. What was seen counts by its confidence.
-    Returns which share of the segment of a pixel lies on its plane, float32 (SEGMENTATIONS, H, W).
+    Returns which fraction of the segment of a pixel lies on its plane, float32 (SEGMENTATIONS, H, W).
     """
-    shares = np.zeros((SEGMENTATIONS, *guide.shape[:2]), np.float32)
+    ratios = np.zeros((SEGMENTATIONS, *guide.shape[:2]), np.float32)
     steps, draws = _steps(guide), np.random.default_rng(0).random((_TRIES, 3))
-    for edge, planes, share in zip(_EDGES, to, shares, strict=True):
+    for edge, planes, ratio in zip(_EDGES, to, ratios, strict=True):
         alike = (steps <= edge).view(np.uint8)
         _, labels, stats, _ = cv2.connectedComponentsWithStats(alike, connectivity=4)
         sizes = stats[:, cv2.CC_STAT_AREA].astype(np.int64)
@@ -49,13 +49,13 @@ def fit_segments(
         wanted = wanted[wanted > 0]  # 0 are edges
         if len(wanted):
             known = seen.values, seen.confidence, order, starts, wanted, draws, SAME_SURFACE_PX
-            fit = partial(_fit, known, planes, share)
+            fit = partial(_fit, known, planes, ratio)
             common.in_strips(pool, threads, fit, len(wanted))
-    return shares
+    return ratios
 
 
-def _fit(known: _Known, to: Float32, shares: Float32, segments: range) -> None:
-    kernels.fit_segments(*known, segments.start, segments.stop, to, shares)
+def _fit(known: _Known, to: Float32, ratios: Float32, segments: range) -> None:
+    kernels.fit_segments(*known, segments.start, segments.stop, to, ratios)
 
 
 def smooth_colours(pair: RectifiedPair) -> UInt8:

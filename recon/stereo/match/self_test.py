@@ -27,8 +27,8 @@ def rendered_pair(size: tuple[int, int] = _SIZE) -> tuple[UInt8, UInt8, Float32]
     """
     width, height = size
     rows, columns = np.mgrid[:height, :width].astype(np.float32)
-    share = 0.4 + 0.4 * rows / height + 0.2 * columns / width
-    disparity = (_NEAREST * width * share).astype(np.float32)
+    ratio = 0.4 + 0.4 * rows / height + 0.2 * columns / width
+    disparity = (_NEAREST * width * ratio).astype(np.float32)
     margin = int(np.ceil(_NEAREST * width)) + 2
     random = np.random.default_rng(0)
     texture = np.zeros((height, width + margin))

@@ -43,7 +43,7 @@ COST_CAP: Final = 14  # largest difference of gradients that counts at one pixel
 LARGEST_COST: Final = COST_CAP + (2 * CENSUS_RADIUS + 1) ** 2 - 1
 # Where the image changes by more along a path, large steps are cheaper: surfaces end there.
 EDGE_GREY_LEVELS: Final = 12
-EDGE_P2_SHARE: Final = 0.25  # share of P2 that is left there
+EDGE_P2_SHARE: Final = 0.25  # fraction of P2 that is left there
 _OVERLAP_ROWS: Final = 4  # rows that strips share, for vertical paths to start in
 _MEMORY_BYTES: Final = 1536 << 20  # what strips that are worked on at once need together, at most
 

@@ -31,7 +31,7 @@ def settle_steps(pair: RectifiedPair, seen: Disparity, reach: int, pool: Executo
 
     Within ``reach`` pixels of a step pixels vote on a disparity by how alike they look; those that
     are beyond the range, such as the sky, for none. Where another surface has more votes it is
-    rejected (`Reason.EDGE`); of what stays, the confidence falls with the share of the votes
+    rejected (`Reason.EDGE`); of what stays, the confidence falls with the fraction of the votes
     against it.
     """
     own = _count_votes(pair, np.where(beyond_range(seen), _BEYOND, seen.values), reach, pool)
@@ -40,7 +40,7 @@ def settle_steps(pair: RectifiedPair, seen: Disparity, reach: int, pool: Executo
 
 
 def _count_votes(pair: RectifiedPair, values: Float32, reach: int, pool: Executor) -> Float32:
-    """Return the share of the votes for each disparity within ``reach`` of a step, else 1.
+    """Return the fraction of the votes for each disparity within ``reach`` of a step, else 1.
 
     float32 (H, W); negative where another surface has more.
     """
@@ -70,6 +70,6 @@ def beyond_range(seen: Disparity) -> Bool:
 
 
 def _doubted(confidence: Float32, own: Float32) -> Float32:
-    """Return confidences whose odds fall with the share of votes against a disparity."""
+    """Return confidences whose odds fall with the fraction of votes against a disparity."""
     kept = np.exp(-_DOUBT * (1 - np.clip(own, 0, 1))).astype(np.float32)
     return np.asarray(confidence * kept / (1 - confidence * (1 - kept)), np.float32)

@@ -19,7 +19,7 @@ from recon.core.text import counted
 from recon.core.values import RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, UInt8, freeze
 
-_RATIO: Final = 0.8  # Lowe's test: the best distance is below this share of the second best
+_RATIO: Final = 0.8  # Lowe's test: the best distance is below this fraction of the second best
 _EXACT_RATIO: Final = 0.75
 _CONTRAST: Final = 0.02  # half of OpenCV's default: weak features are still located accurately
 _BLOCK: Final = 1024  # descriptors compared with all others at once
@@ -193,7 +193,7 @@ _OUTLIER_PX: Final = 3.0  # between the epipolar error of a wrong match and that
 INSPECTED: Final = 1000  # maximum number of features per image of a pair that is inspected
 _MIN_FEATURES: Final = 40  # with fewer matched features there is no verdict
 _WARN_EPIPOLAR_PX: Final = 1.0  # median epipolar error that gives a warning, in pixels
-_SWAPPED_SHARE: Final = 0.8  # of near features with negative disparity: swapped cameras
+_SWAPPED_RATIO: Final = 0.8  # of near features with negative disparity: swapped cameras
 
 
 @dataclass(frozen=True)
@@ -204,8 +204,8 @@ class PairInspection:
     epipolar_error_px: float  # median of right minus left row; 0 if the rows are aligned
     row_spread_px: float  # robust standard deviation of that (from the median absolute deviation)
     near: int  # number of features near enough to show whether the cameras are swapped
-    #: Share of those with a negative disparity: about 0, or about 1 if the cameras are swapped.
-    negative_share: float
+    #: Fraction of those with a negative disparity: about 0, or about 1 if the cameras are swapped.
+    negative_ratio: float
 
 
 def inspect_pair(pair: RectifiedPair) -> PairInspection:
@@ -235,11 +235,11 @@ def inspect_features(
 
 def check_inspection(inspection: PairInspection, where: str | None = None) -> tuple[str, ...]:
     """Return warnings about a pair; none if it is good or has too few features."""
-    if inspection.negative_share >= _SWAPPED_SHARE:
+    if inspection.negative_ratio >= _SWAPPED_RATIO:
         raise CalibrationError(
             "left and right images are swapped",
             where=where,
-            got=f"{100 * inspection.negative_share:.0f} % of {counted(inspection.near, 'feature')} "
+            got=f"{100 * inspection.negative_ratio:.0f} % of {counted(inspection.near, 'feature')} "
             "farther right in the right image",
             expected="farther left",
             hint="give the left camera's images first (or un-mirror the images)",

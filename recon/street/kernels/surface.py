@@ -222,7 +222,7 @@ def value_noise(xyz: Float64, seed: int) -> Float64:
     total = np.zeros(len(xyz))
     for corner in np.ndindex(2, 2, 2):
         step = np.array(corner)
-        share = np.where(step == 1, weight, 1.0 - weight).prod(axis=1)
+        ratio = np.where(step == 1, weight, 1.0 - weight).prod(axis=1)
         ix, iy, iz = (base + step).astype(np.int64).T
-        total += share * lattice_values(ix, iy, iz, seed)
+        total += ratio * lattice_values(ix, iy, iz, seed)
     return total

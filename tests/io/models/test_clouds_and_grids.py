@@ -431,8 +431,8 @@ def as_nav2_loads(description: Path, *, ends_apart: bool) -> np.ndarray:
     pixels = cv2.imread(str(description.parent / fields["image"]), cv2.IMREAD_UNCHANGED)
     occupancy = 1.0 - pixels[..., :3].mean(axis=2) / 255.0
     low, high = fields["free_thresh"], fields["occupied_thresh"]
-    share = (occupancy - low) / (high - low)
-    cells = np.rint(1 + 98 * share if ends_apart else 100 * share)
+    ratio = (occupancy - low) / (high - low)
+    cells = np.rint(1 + 98 * ratio if ends_apart else 100 * ratio)
     cells[occupancy < low] = 0
     cells[occupancy > high] = 100
     cells[pixels[..., 3] != 255] = -1

@@ -166,16 +166,16 @@ def _frame(index: int) -> ReconstructedFrame:
     return ReconstructedFrame(pair, disparity, PointCloud(np.zeros((0, 3), np.float32)))
 
 
-def _circle(share: float = 0.0) -> Trajectory:
+def _circle(ratio: float = 0.0) -> Trajectory:
     """The path; with a share, each step is too long by that much."""
     turn = 2 * math.pi / LAP
     step = make_transform(
-        exp_so3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, STEP_M * (1.0 + share)])
+        exp_so3(np.array([0.0, turn, 0.0])), np.array([0.0, 0.0, STEP_M * (1.0 + ratio)])
     )
     poses = [np.eye(4)]
     for _ in range(FRAMES - 1):
         poses.append(poses[-1] @ step)
-    if share:  # odometry is not wrong in the same way everywhere, or even a circle would close
+    if ratio:  # odometry is not wrong in the same way everywhere, or even a circle would close
         tilt = make_transform(exp_so3(np.array([0.0, 0.03, 0.0])), np.zeros(3))
         poses[LAP // 2 :] = [
             poses[LAP // 2] @ tilt @ invert(poses[LAP // 2]) @ T for T in poses[LAP // 2 :]

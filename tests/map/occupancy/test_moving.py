@@ -95,8 +95,8 @@ def _drive(
 
 def _off(cloud: PointCloud, off_px: float) -> PointCloud:
     """What a rig sees whose disparities are too large by so much."""
-    share = FOCAL_BASELINE / (FOCAL_BASELINE + off_px * cloud.xyz[:, 2:])
-    return replace(cloud, xyz=(cloud.xyz * share).astype("f4"))
+    ratio = FOCAL_BASELINE / (FOCAL_BASELINE + off_px * cloud.xyz[:, 2:])
+    return replace(cloud, xyz=(cloud.xyz * ratio).astype("f4"))
 
 
 def _tiles(*drives: Drive, remove: bool = True) -> Tiles:
@@ -383,8 +383,8 @@ def _while(frames: slice, number: int) -> np.ndarray:
     return seen
 
 
-def _at_random(share: float) -> np.ndarray:
-    return np.where(np.random.default_rng(3).random((LOOKS, len(WALL))) < share, 1, -1)
+def _at_random(ratio: float) -> np.ndarray:
+    return np.where(np.random.default_rng(3).random((LOOKS, len(WALL))) < ratio, 1, -1)
 
 
 SINCE = np.arange(LOOKS)[:, None] - 2 * WALL[:, 0]
@@ -398,7 +398,7 @@ POSES_BEFORE_LINKS = _while(slice(3, 5), 1)
     (np.maximum(BODY, _while(slice(20, 24), len(WALL))), True),  # one after the other
     # Column after column is hit, each for six frames: it enters by one edge.
     (np.where((SINCE >= 3) & (SINCE < 9), 1, -1), True),
-    *((_at_random(share), False) for share in (0.1, 0.3, 0.5)),
+    *((_at_random(ratio), False) for ratio in (0.1, 0.3, 0.5)),
     # Boards of a fence are hit or looked through from top to bottom, whatever the others are.
     (np.where(BOARDS[:, WALL[:, 0]], 1, -1), False),
     *((np.full((LOOKS, len(WALL)), always), False) for always in (-1, 0, 1)),

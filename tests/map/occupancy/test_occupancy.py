@@ -72,12 +72,12 @@ def test_a_point_ahead_lies_forward_in_the_map():
 def test_log_odds_follow_the_settings_and_their_clamps():
     cloud = _points((0.1, 0.1, 5.1))
     half = replace(cloud, confidence=np.float32([0.5]))
-    for clouds, share, hit, miss in (
+    for clouds, ratio, hit, miss in (
         ([cloud], 1.0, 0.7, 0.4), ([half], 0.5, 0.7, 0.4), ([cloud] * 40, 1.0, 0.97, 0.12)
     ):  # fmt: skip
         cells = _map(*((one, HERE) for one in clouds))
-        assert cells[0, 0, 25] == pytest.approx(share * math.log(hit / (1 - hit)), rel=1e-5)
-        assert cells[0, 0, 10] == pytest.approx(share * math.log(miss / (1 - miss)), rel=1e-5)
+        assert cells[0, 0, 25] == pytest.approx(ratio * math.log(hit / (1 - hit)), rel=1e-5)
+        assert cells[0, 0, 10] == pytest.approx(ratio * math.log(miss / (1 - miss)), rel=1e-5)
 
 
 def test_free_space_ends_before_an_uncertain_point_and_at_the_range():

@@ -16,7 +16,7 @@ MODEL = bundle.BundleModel(
 Window = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def make_window(seed: int, frames: int, points: int, seen_share: float = 0.7) -> Window:
+def make_window(seed: int, frames: int, points: int, seen_ratio: float = 0.7) -> Window:
     """Poses, observations with noise, holes and outliers, and points; some behind the camera."""
     rng = np.random.default_rng(seed)
     poses = [
@@ -31,7 +31,7 @@ def make_window(seed: int, frames: int, points: int, seen_share: float = 0.7) ->
     uvd = np.stack([u, v, 150 / z - 3], axis=-1)
     noise = rng.normal(0, 0.5, uvd.shape)
     uvd += noise * np.where(rng.random(uvd.shape[:2]) < 0.1, 40, 1)[..., None]
-    uvd[rng.random(uvd.shape[:2]) > seen_share] = np.nan
+    uvd[rng.random(uvd.shape[:2]) > seen_ratio] = np.nan
     uvd[rng.random(uvd.shape[:2]) < 0.2, 2] = np.nan
     return T, uvd, xyz
 
@@ -41,7 +41,7 @@ windows = st.builds(
     seed=st.integers(0, 2**20),
     frames=st.integers(1, 5),
     points=st.integers(0, 25),
-    seen_share=st.sampled_from([0.0, 0.5, 1.0]),
+    seen_ratio=st.sampled_from([0.0, 0.5, 1.0]),
 )
 
 

@@ -32,7 +32,7 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     assert 0.05 < found["epipolar_px"] < found["epipolar_95_px"] < 0.5
     normals = np.array([abs(T[2, 2]) for T in fit.state.T_rig_board])
     assert found["tilt_max_deg"] == pytest.approx(np.degrees(np.arccos(normals.min())))
-    assert found["tilted_share"] == np.mean(normals <= np.cos(np.radians(20)))
+    assert found["tilted_ratio"] == np.mean(normals <= np.cos(np.radians(20)))
     away = [np.linalg.norm(T[:3, :3] @ [0.1, 0.0625, 0] + T[:3, 3]) for T in fit.state.T_rig_board]
     assert found["far_to_near"] == pytest.approx(max(away) / min(away), rel=1e-6)
     pixels = np.concatenate([view.seen[0].pixels for view in views])
@@ -51,16 +51,16 @@ PAIRS = ImagePairs((), by_order=False)
 
 
 GOOD: dict[str, Any] = {
-    "working_error": {"distance_m": 4.0, "calibration_share": 0.01, "matching_share": 0.02},
+    "working_error": {"distance_m": 4.0, "calibration_ratio": 0.01, "matching_ratio": 0.02},
     "views_used": 25, "views_dropped": [], "views_repeated": [], "pictures_without_board": [],
-    "coverage_left": 0.9, "coverage_right": 0.9, "tilted_share": 0.7, "far_to_near": 3.0,
+    "coverage_left": 0.9, "coverage_right": 0.9, "tilted_ratio": 0.7, "far_to_near": 3.0,
     "stereo_rms_px": 0.2, "left_rms_px": 0.2, "right_rms_px": 0.2, "epipolar_95_px": 0.3,
     "baseline_m": 0.12, "focal_px": 500.0, "focal_interval_px": [499.0, 501.0],
 }  # fmt: skip
 
 
-def error(share: float | None) -> dict[str, Any]:
-    return {"working_error": {"distance_m": 4.0, "calibration_share": share}}
+def error(ratio: float | None) -> dict[str, Any]:
+    return {"working_error": {"distance_m": 4.0, "calibration_ratio": ratio}}
 
 
 def judge(board: str = CHESS, **other: Any) -> tuple[str, dict[str, str]]:
@@ -69,7 +69,7 @@ def judge(board: str = CHESS, **other: Any) -> tuple[str, dict[str, str]]:
 
 
 @pytest.mark.parametrize(
-    ("board", "share", "verdict", "said"),
+    ("board", "ratio", "verdict", "said"),
     [
         (CHESS, 0.005, "good", None),
         (CHESS, 0.019, "good", None),
@@ -80,9 +80,9 @@ def judge(board: str = CHESS, **other: Any) -> tuple[str, dict[str, str]]:
     ],
 )
 def test_the_verdict_is_that_of_the_depth_error_at_the_working_distance(
-    board, share, verdict, said
+    board, ratio, verdict, said
 ):
-    given, texts = judge(board, **error(share))
+    given, texts = judge(board, **error(ratio))
     assert given == verdict
     assert said is None or said in texts["depth"]
 
@@ -107,7 +107,7 @@ def test_what_makes_the_forecast_doubtful_makes_it_usable_at_best(other, code, f
     ("other", "code", "figure"),
     [
         ({"coverage_left": 0.67}, "corners", "67 % of the left"),
-        ({"tilted_share": 0.2}, "tilt", "20 degrees or more in 20 %"),
+        ({"tilted_ratio": 0.2}, "tilt", "20 degrees or more in 20 %"),
         ({"far_to_near": 1.2}, "distances", "1.2 times"),
         ({"focal_interval_px": [480.0, 520.0]}, "focal", "480.0 to 520.0 px"),
         ({"views_used": 13}, "more", "13 different ones"),

@@ -191,9 +191,9 @@ def test_the_intervals_hold_the_truth_in_most_repeats(make_views, lens):
             truths[f"{each.depth_m:g} m"] = (each.low_m, each.high_m, error)
         for name, (low, high, truth) in truths.items():
             held.setdefault(name, []).append(bool(low <= truth <= high))
-    shares = {name: float(np.mean(each)) for name, each in held.items()}
-    sys.stdout.write(f"{lens}: share of intervals that hold the truth: {shares}\n")
-    assert min(shares.values()) >= 0.85, shares
+    ratios = {name: float(np.mean(each)) for name, each in held.items()}
+    sys.stdout.write(f"{lens}: fraction of intervals that hold the truth: {ratios}\n")
+    assert min(ratios.values()) >= 0.85, ratios
 
 
 def again(views: list[View], times: int, sigma_px: float, seed: int = 9) -> list[View]:

@@ -139,8 +139,8 @@ def test_a_function_is_called_with_each_item_and_its_error_is_raised(cluster, tm
 
 def test_workers_share_the_cores_of_this_machine(monkeypatch):
     monkeypatch.setattr("recon.run.batch.cluster.available_cores", lambda: 8)
-    shares = [BatchOptions(workers=count).threads_of(None) for count in (None, 1, 3, 9)]
-    assert shares == [1, 8, 2, 1]
+    ratios = [BatchOptions(workers=count).threads_of(None) for count in (None, 1, 3, 9)]
+    assert ratios == [1, 8, 2, 1]
     assert BatchOptions(workers=3).threads_of(5) == 5
     assert BatchOptions(scheduler="tcp://x:1").threads_of(None) is None
 

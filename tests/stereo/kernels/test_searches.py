@@ -195,7 +195,7 @@ def offer_supported_reference(halved, minimum, ndisp, support, tiles):
         seen = seen & (x // 2 >= left // 2) & (x // 2 < right // 2)
         matched = np.count_nonzero(seen & np.isfinite(halved))
         near = (k >= group * GROUP - support.margin) & (k < (group + 1) * GROUP + support.margin)
-        enough = np.count_nonzero(seen & near) >= max(support.share * matched, support.least)
+        enough = np.count_nonzero(seen & near) >= max(support.ratio * matched, support.least)
         offered[i, j, group] = enough or matched < support.matched * np.count_nonzero(seen)
     return offered
 
@@ -215,7 +215,7 @@ supports = st.builds(
     margin_y=st.integers(0, 9),
     margin=st.integers(0, 9),
     matched=st.sampled_from([0.0, 0.3, 1.0]),
-    share=st.sampled_from([0.0, 0.1, 0.6]),
+    ratio=st.sampled_from([0.0, 0.1, 0.6]),
     least=st.integers(0, 5),
 )
 disparities = st.one_of(st.just(np.nan), st.integers(-4, 30))

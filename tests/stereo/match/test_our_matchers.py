@@ -417,9 +417,9 @@ def test_disparities_of_real_pairs_are_right_as_sigma_and_confidence_say(recon_d
     assert 0.63 < (ratio < 1).mean() < 0.8
     assert 0.86 < (ratio < 2).mean() < 0.97
     ends, right = (0.6, 0.7, 0.8, 0.9), np.abs(error) < 1
-    share = [right[(confidence >= a) & (confidence < a + 0.1)].mean() for a in ends]
-    assert share == sorted(share)
-    assert share[-1] > 0.95
+    ratio = [right[(confidence >= a) & (confidence < a + 0.1)].mean() for a in ends]
+    assert ratio == sorted(ratio)
+    assert ratio[-1] > 0.95
 
 
 @pytest.mark.slow

@@ -81,8 +81,8 @@ def take_votes_reference(values, grey, alike, marked, vote):
                 limit = vote.same_px + vote.slope * max(abs(dy), abs(dx))
                 side = 0 if apart > limit else 2 if apart < -limit else 1
                 sums[side] += alike[abs(int(grey[v, u]) - int(grey[y, x]))]
-        share = sums[1] / sums.sum()
-        own[y, x] = share if sums[1] >= max(sums[0], sums[2]) else share - 1
+        ratio = sums[1] / sums.sum()
+        own[y, x] = ratio if sums[1] >= max(sums[0], sums[2]) else ratio - 1
     return own
 
 

@@ -292,12 +292,12 @@ def test_a_good_pair_has_rows_that_correspond_whatever_wrong_matches_say():
     # A tenth of a pixel: cubic interpolation and one grey level of noise.
     assert abs(found.epipolar_error_px) < 0.1
     assert 0.0 <= found.row_spread_px < 0.3
-    assert found.negative_share < 0.02
+    assert found.negative_ratio < 0.02
     assert features.check_inspection(found) == ()
     # Middlebury's doffs: a far point may have a negative disparity in a good pair.
     crossed = wall_pair(disparity_px=-12.0)
     crossed = replace(crossed, camera=replace(CAMERA, cx_right_px=CAMERA.cx_px + 30.0))
-    assert features.inspect_pair(crossed).negative_share < 0.02
+    assert features.inspect_pair(crossed).negative_ratio < 0.02
     rng = np.random.default_rng(3)
     left = rng.uniform(0, 400, (300, 2)).astype(np.float32)
     right = left + np.float32([-10.0, 2.0]) + rng.normal(0, 0.2, left.shape).astype(np.float32)
@@ -324,7 +324,7 @@ def test_rows_that_are_off_are_measured_and_said_whatever_the_exposure(row_px):
 def test_swapped_cameras_are_an_error_that_says_so(row_px):
     pair = wall_pair(row_px=row_px)
     found = features.inspect_pair(replace(pair, left=pair.right, right=pair.left))
-    assert found.negative_share > 0.98
+    assert found.negative_ratio > 0.98
     with pytest.raises(CalibrationError, match="frame 7: left and right images are swapped"):
         features.check_inspection(found, where="frame 7")
 
@@ -335,6 +335,6 @@ def test_blank_images_other_scenes_and_one_at_infinity_give_no_answer():
     assert found.features == 0
     assert np.isnan(found.epipolar_error_px)
     far = features.inspect_pair(wall_pair(disparity_px=0.3))
-    assert np.isnan(far.negative_share)
+    assert np.isnan(far.negative_ratio)
     strangers = features.inspect_pair(replace(wall_pair(seed=1), right=wall_pair(seed=2).right))
     assert [features.check_inspection(each) for each in (found, far, strangers)] == [(), (), ()]
