@@ -227,10 +227,10 @@ def occupancy(
     """
     with one_line_errors(quiet=quiet):
         from recon.commands.evaluate import run_evaluate_occupancy
-        from recon.core.text import plain
+        from recon.core.text import to_json
 
         compared = run_evaluate_occupancy(run, least_frames, image=picture)
-        figures = {**plain(compared.metrics), "warnings": compared.doubts}
+        figures = {**to_json(compared.metrics), "warnings": compared.doubts}
     if json:
         print_json(figures)
         return

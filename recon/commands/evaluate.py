@@ -13,7 +13,7 @@ from recon.commands.config import run_settings
 from recon.commands.demo import demo_source
 from recon.core.errors import EvaluationError, SettingsError
 from recon.core.progress import stage
-from recon.core.text import counted, plain
+from recon.core.text import counted, to_json
 from recon.core.values import (
     Disparity,
     DisparityTruth,
@@ -91,7 +91,7 @@ def run_evaluate_trajectory(
     comparison = compare_paths(ours, true, rules)
     few = f"a partner in time for only {len(true)} of {counted(fewer, 'pose')}; see --tolerance"
     summary = {
-        **plain(comparison.metrics),
+        **to_json(comparison.metrics),
         "T_truth_estimate": comparison.motion.T_to_from.tolist(),
         "rotation_deg": float(np.degrees(np.sqrt((comparison.rotation_errors_rad**2).mean()))),
         "roll": "fixed" if comparison.roll_axis is None else "not observable on a straight path",
@@ -167,7 +167,7 @@ def run_evaluate_map(
         else:
             placed, moved = place_cloud(mapped, frame or "camera", align_to)
         truth = replace(truth, frame=placed.cloud.frame)
-        by_threshold = [plain(evaluate_map(placed.cloud, truth, limit)) for limit in thresholds_m]
+        by_threshold = [to_json(evaluate_map(placed.cloud, truth, limit)) for limit in thresholds_m]
     beyond = add_within_reach(placed, truth, by_threshold)
     aligned = icp or align_to is not None
     axes = moved.get("reference_frame", frame or "camera")
@@ -227,7 +227,7 @@ def run_evaluate_disparity(
         compared = np.where(counted, true, np.float32(np.nan))
         measured = DisparityTruth(compared, np.isfinite(compared))
         figures["confidence"] = curve_figures(_rated(values, confidence), measured, limit_px=1.0)
-    return dict(plain(figures))
+    return dict(to_json(figures))
 
 
 def _rated(values: Float32, path: Path) -> Disparity:

@@ -22,7 +22,7 @@ from recon.core.errors import (
     SourceError,
 )
 from recon.core.plugins import name_of
-from recon.core.text import counted, plain
+from recon.core.text import counted, to_json
 from recon.core.values import (
     OccupancyGrid,
     PointCloud,
@@ -341,7 +341,7 @@ def _summary(
         "frames": frames,
         "fps": frames / mapped.seconds if mapped.seconds > 0 else None,
         "frames_joined": int(mapped.joined.sum()),
-        "segments": [plain(session) for session in mapped.sessions],
+        "segments": [to_json(session) for session in mapped.sessions],
         "path_length_m": mapped.trajectory.select(mapped.joined).path_length_m,
         "expected_drift_percent": None if drift is None else drift.percent,
         "expected_drift_rig_percent": None if drift is None else drift.rig_percent,
@@ -355,11 +355,11 @@ def _summary(
         **result.made.figures,
         "warnings": warnings,
         **({} if mapped.loops is None else {"loops": mapped.loops.figures()}),
-        **({} if mapped.imu is None else {"imu": plain(mapped.imu.summary())}),
+        **({} if mapped.imu is None else {"imu": to_json(mapped.imu.summary())}),
         **({} if mapped.sfm is None else {"sfm": mapped.sfm.figures()}),
-        **{name: plain(found) for name, found in known.items() if found is not None},
+        **{name: to_json(found) for name, found in known.items() if found is not None},
         **source.figures(),
-        **({} if prior is None else {"prior": {"from": options.prior_origin, **plain(prior)}}),
+        **({} if prior is None else {"prior": {"from": options.prior_origin, **to_json(prior)}}),
     }
 
 

@@ -14,7 +14,7 @@ from recon.commands.kernels import compile_kernels
 from recon.core.errors import SettingsError
 from recon.core.plugins import name_of
 from recon.core.progress import stage
-from recon.core.text import plain
+from recon.core.text import to_json
 from recon.core.values import (
     Disparity,
     Reason,
@@ -149,7 +149,7 @@ def _compared(
     summary = {
         "pair": name,
         **_disparity_figures(disparity),
-        **({} if metrics is None else {"disparity": {**plain(metrics), **plain(by_kind)}}),
+        **({} if metrics is None else {"disparity": {**to_json(metrics), **to_json(by_kind)}}),
         **_network_figures(config.matching),
         **figures,
         "warnings": list(warnings),

@@ -15,7 +15,7 @@ from pydantic import Field, field_validator
 
 from recon.core.errors import CalibrationError, MatchingError, SourceError
 from recon.core.settings import Settings
-from recon.core.text import plain
+from recon.core.text import to_json
 from recon.core.values import (
     Disparity,
     DisparityTruth,
@@ -222,7 +222,7 @@ def apply_method(
         "valid_percent": 100.0 * float(disparity.valid.mean()),
         "points": len(cloud),
         "depth_median_m": float(np.median(known_m)) if len(known_m) else None,
-        "disparity": None if truth is None else plain(evaluate_disparity(disparity, truth)),
+        "disparity": None if truth is None else to_json(evaluate_disparity(disparity, truth)),
         "depth": None if truth is None else compare_depth(depth_m, truth, experiment.camera),
     }
     return MethodResult(method, pair, disparity, depth_m, cloud, figures)
@@ -279,4 +279,4 @@ def _patch_figures(patch_px: int, found: Disparity, truth: DisparityTruth | None
         bad, error = metrics.bad[BAD_PX], metrics.avgerr_px
         right = 100 - bad - metrics.invalid
     valid = {"patch_px": patch_px, "valid_percent": 100 * float(found.valid.mean())}
-    return dict(plain({**valid, "bad_percent": bad, "right_percent": right, "avgerr_px": error}))
+    return dict(to_json({**valid, "bad_percent": bad, "right_percent": right, "avgerr_px": error}))

@@ -18,7 +18,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import make_transform
 from recon.core.progress import stage
-from recon.core.text import metres, plain
+from recon.core.text import metres, to_json
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
 from recon.look.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
@@ -234,7 +234,7 @@ class RefinedRig:
             "not_visible": "baseline",
             **lengths,
         }
-        return dict(plain(figures))
+        return dict(to_json(figures))
 
     def describe(self, depth_m: float) -> str:
         """Return in words what the drive shows of the rig given, and what it does to a depth."""

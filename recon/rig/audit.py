@@ -10,7 +10,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError
 from recon.core.progress import stage
-from recon.core.text import plain
+from recon.core.text import to_json
 from recon.core.values import Disparity, Reason, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import depth_sigma
@@ -151,19 +151,19 @@ def _figures(look: Look) -> dict[str, Any]:
         "frozen_left_frames": sample.repeats.frozen[0],
         "frozen_right_frames": sample.repeats.frozen[1],
         "gaps": gaps.count,
-        "longest_step_s": plain(gaps.longest_s),
-        "usual_step_s": plain(gaps.usual_s),
-        "gain": plain(sample.gain[0]),
+        "longest_step_s": to_json(gaps.longest_s),
+        "usual_step_s": to_json(gaps.usual_s),
+        "gain": to_json(sample.gain[0]),
         "sharpness_left": sharpness[0],
         "sharpness_right": sharpness[1],
         "features": len(geometry.features),
-        "swapped_ratio": plain(geometry.swapped_ratio),
+        "swapped_ratio": to_json(geometry.swapped_ratio),
         "time_offset_frames": geometry.offset,
         "time_skew_frames": None if look.skew is None else look.skew[0],
         "baseline_m": camera.baseline_m,
         "focal_px": camera.focal_px,
         "field_of_view_deg": camera.field_of_view_deg,
-        "speed_m_per_s": plain(sample.speed_m_per_s),
+        "speed_m_per_s": to_json(sample.speed_m_per_s),
         **_alignment_figures(geometry.alignment, geometry.disparity_px, camera),
         **({"rig_by_motion": rig.figures()} if rig.fitted else {}),
     }

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from recon.core.errors import CalibrationError
-from recon.core.text import plain
+from recon.core.text import to_json
 from recon.core.values import StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64, UInt8, size_text
 from recon.io.cameras.calibration import read_calibration
@@ -120,7 +120,7 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
         "method": "features",
         "model": result.model,
         "up_to_scale": True,
-        **plain(result),
+        **to_json(result),
         "H_left": result.H_left.tolist(),
         "H_right": result.H_right.tolist(),
         "fundamental": result.fundamental.tolist(),

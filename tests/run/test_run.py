@@ -15,7 +15,7 @@ import yaml
 from recon.core.errors import FormatError, OutputError
 from recon.core.progress import Silent, showing
 from recon.core.settings import Settings
-from recon.core.text import plain
+from recon.core.text import to_json
 from recon.io.atomic import exchange
 from recon.io.files import fingerprint, refuse_links
 from recon.run import directory
@@ -171,7 +171,7 @@ def test_a_failed_run_leaves_an_earlier_run_as_it_was_or_no_folder(tmp_path):
     assert files_in(tmp_path / "run") == {"map/cloud.ply", "run.json"}
     figures = _Figures(error=math.nan, bad={0.5: 1.25, 2.0: math.inf}, lengths=(50.0, 100.0))
     expected = {"error": None, "bad": {"0.5": 1.25, "2.0": None}, "lengths": [50.0, 100.0]}
-    assert json.loads(json.dumps(plain(figures), allow_nan=False)) == expected
+    assert json.loads(json.dumps(to_json(figures), allow_nan=False)) == expected
 
 
 @pytest.mark.parametrize(

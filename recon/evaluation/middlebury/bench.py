@@ -14,7 +14,7 @@ import numpy as np
 
 from recon.core.errors import FormatError, SettingsError, SourceError
 from recon.core.plugins import name_of
-from recon.core.text import counted, plain
+from recon.core.text import counted, to_json
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32
 from recon.evaluation.middlebury.score import (
@@ -199,7 +199,7 @@ def summarise_scenes(
         "skipped": skipped,
         "warnings": warnings,
     }
-    return dict(plain(summary))
+    return dict(to_json(summary))
 
 
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequence[str]) -> Figures:

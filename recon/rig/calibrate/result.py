@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.text import plain
+from recon.core.text import to_json
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
 from recon.rig.calibrate.board_views import BoardViews
@@ -105,12 +105,12 @@ def _summarise(
         "tilted_ratio": float((tilts_deg >= TILT_DEG).mean()),
         "far_to_near": float(away_m.max() / away_m.min()),
         "depth_error_cm": {
-            f"{each.depth_m:g}": {k: plain(100.0 * getattr(each, f"{k}_m")) for k in _DEPTH_CM}
+            f"{each.depth_m:g}": {k: to_json(100.0 * getattr(each, f"{k}_m")) for k in _DEPTH_CM}
             for each in spread.depths
         },
         "working_error": {
             "distance_m": spread.working.depth_m,
-            "calibration_ratio": plain(spread.working.calibration_m / spread.working.depth_m),
+            "calibration_ratio": to_json(spread.working.calibration_m / spread.working.depth_m),
             "matching_ratio": spread.working.matching_m / spread.working.depth_m,
         },
     }
