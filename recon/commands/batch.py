@@ -79,4 +79,4 @@ def _hint(folder: Path) -> Iterator[None]:
     except ClusterError as error:
         if not (folder / PLAN).is_file():
             raise
-        raise error.but(hint=hint) from error
+        raise error.copy_with(hint=hint) from error

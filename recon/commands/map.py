@@ -385,9 +385,9 @@ def _with_hint(error: BaseException, hint: str) -> BaseException | None:
         case KeyboardInterrupt():
             return KeyboardInterrupt(hint)
         case OutputError() | ClusterError():
-            return error.but(hint=hint)
+            return error.copy_with(hint=hint)
         case MemoryLimitError():
-            return error.but(hint=f"{hint} with a larger --memory-limit")
+            return error.copy_with(hint=f"{hint} with a larger --memory-limit")
         case MemoryError():
             return MemoryLimitError("out of memory", hint=f"{hint}; give it a --memory-limit")
         case OSError(errno=errno.ENOSPC | errno.EDQUOT | errno.EFBIG, strerror=why):

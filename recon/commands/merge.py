@@ -117,7 +117,7 @@ def run_map_into(
         try:
             return _copied(kept, map_, settings)
         except (FormatError, SettingsError) as error:  # not the file, which does not stay
-            raise error.but(where=source.name) from error
+            raise error.copy_with(where=source.name) from error
 
     files = [folder / MAP_FILE, *source.files]
     return _make_joined(options, settings, fill, files, replaced=folder)

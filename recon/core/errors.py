@@ -39,7 +39,7 @@ class ReconError(Exception):
         self.hint = hint
         super().__init__(self._line())
 
-    def but(self, **parts: Any) -> Self:
+    def copy_with(self, **parts: Any) -> Self:
         own = {name: getattr(self, name) for name in ("where", "got", "expected", "hint")}
         return type(self)(self.what, **{**own, **parts})
 

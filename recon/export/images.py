@@ -95,7 +95,7 @@ def open_images(map_: Map, moved: Sequence[Path] = ()) -> list[DriveImages]:
             rig = _rig(session, source)
         except ReconError as error:
             hint = "name the drive, as it was mapped, with --images"
-            raise error.but(hint=error.hint or hint) from error
+            raise error.copy_with(hint=error.hint or hint) from error
         prefix = "" if alone else f"{session.number}_"
         opened.append(DriveImages(session, placed[session.number], prefix, source, rig))
     return opened

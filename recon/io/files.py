@@ -50,7 +50,7 @@ def naming(path: StrPath) -> Iterator[None]:
     except ReconError as error:
         if error.where is not None:
             raise
-        raise error.but(where=path) from error
+        raise error.copy_with(where=path) from error
 
 
 @contextmanager

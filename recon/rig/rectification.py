@@ -105,7 +105,7 @@ def plan_by_features(images: ImagePairs) -> RectifyPlan:
             raise
         hint = f"{error.hint}; or it has too few good matches, and several pairs are needed: "
         hint += "give two folders of one rig, or a calibration with --calib"
-        raise error.but(where=images.pairs[0][0], hint=hint) from error
+        raise error.copy_with(where=images.pairs[0][0], hint=hint) from error
 
     def warp(pair: StereoPair) -> tuple[UInt8, UInt8]:
         if result.model == "raw":

@@ -94,7 +94,7 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
         rig, texts = read_rig(settings, home, size)
     except CalibrationError as error:
         hint = _how_to_cut(videos[0], settings, home) if len(videos) == 1 else None
-        raise error.but(hint=hint or error.hint) from error
+        raise error.copy_with(hint=hint or error.hint) from error
     rate_hz = settings.rate_hz or videos[0].rate_hz
     layout = "two videos" if len(videos) == 2 else f"{settings.side_by_side} in one video"
     return VideoSource(

@@ -108,7 +108,7 @@ def _job_list(content: Any, path: Path) -> JobList:
         listed = JobList.model_validate(content)
     except ValidationError as error:
         hint = f"a file has job and sweep, a job has {', '.join(Entry.model_fields)}"
-        raise settings_error(error, where=str(path)).but(hint=hint) from error
+        raise settings_error(error, where=str(path)).copy_with(hint=hint) from error
     count = len(listed.job) * math.prod(map(len, listed.sweep.values()))
     if count > _MOST_JOBS:
         raise SettingsError("too many jobs", where=path, got=count)
