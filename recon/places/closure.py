@@ -90,7 +90,7 @@ class DrivePath:
 
 
 @dataclass(frozen=True, eq=False)
-class Tie:
+class Constraint:
     """A place that two drives saw, or one drive twice."""
 
     drives: tuple[int, int]  # numbers of the drives of the loop's first and last frame
@@ -99,15 +99,15 @@ class Tie:
 
 @dataclass(frozen=True, eq=False)
 class JoinedDrives:
-    """Paths after all drives were joined by their ties."""
+    """Paths after all drives were joined by their constraints."""
 
     trajectories: tuple[Trajectory, ...]  # one for each drive, in the world of the first
-    kept: Bool  # (T,), ties that the rest of the graph does not contradict
+    kept: Bool  # (T,), constraints that the rest of the graph does not contradict
 
 
 def close_loops(path: DrivePath, loops: Sequence[Loop]) -> Closure:
     """Correct a path by odometry so that its loops close, by `join_drives`."""
-    joined = join_drives([path], [Tie((0, 0), loop) for loop in loops]) if loops else None
+    joined = join_drives([path], [Constraint((0, 0), loop) for loop in loops]) if loops else None
     if joined is None:  # a map by odometry alone is better than none
         return Closure(path.trajectory, (), tuple(loops))
     believed = _believed(loops, joined.kept, path.segment)
@@ -137,33 +137,33 @@ def _believed(loops: Sequence[Loop], kept: Bool, segment: NDArray[np.int64]) -> 
 
 
 def join_drives(
-    drives: Sequence[DrivePath], ties: Sequence[Tie], held: Held | None = None
+    drives: Sequence[DrivePath], constraints: Sequence[Constraint], held: Held | None = None
 ) -> JoinedDrives | None:
-    """Correct the paths of drives so that their ties hold; None = the ties are not believed.
+    """Correct the paths of drives so that their constraints hold; None = the constraints are not believed.
 
     Fixed is the first pose of the longest segment of the first drive. Nodes are spaced along the
-    paths; odometry edges link each to the next of its segment, ties link distant ones. The
-    optimiser may switch ties off. It starts with a tolerance that admits every tie and tightens it
+    paths; odometry edges link each to the next of its segment, constraints link distant ones. The
+    optimiser may switch constraints off. It starts with a tolerance that admits every constraint and tightens it
     step by step, so that a right one is not refused because of the very drift that it corrects. If
-    the ties deform the odometry of a drive more than its drift explains, none is believed.
+    the constraints deform the odometry of a drive more than its drift explains, none is believed.
 
     Ref: Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
-    ties_of = [_tied_frames(ties, number) for number in range(len(drives))]
-    nodes = _spaced(drives, ties_of)
+    constraints_of = [_constrained_frames(constraints, number) for number in range(len(drives))]
+    nodes = _spaced(drives, constraints_of)
     begins = np.cumsum([0, *map(len, nodes)]).tolist()
     ratio = 1.0 if held is None else USUAL
     chains = [
         odometry_edges(drive, own, begin, ratio)
         for drive, own, begin in zip(drives, nodes, begins[:-1], strict=True)
     ]
-    edges = [_tie_edge(tie, drives, nodes, begins) for tie in ties]
+    edges = [_constraint_edge(constraint, drives, nodes, begins) for constraint in constraints]
     start = [d.trajectory.T_world_camera[own] for d, own in zip(drives, nodes, strict=True)]
     parts = [
         _numbered(d.segment[own], k) for k, (d, own) in enumerate(zip(drives, nodes, strict=True))
     ]
     root = longest_segment(drives[0].segment)
-    begun = _beside(np.concatenate(start), np.concatenate(parts), root, ties, edges)
+    begun = _beside(np.concatenate(start), np.concatenate(parts), root, constraints, edges)
     anchor = int(np.argmax(drives[0].segment[nodes[0]] == root))
     steps = [edge for chain in chains for edge in chain]
     try:
@@ -176,7 +176,7 @@ def join_drives(
     deformations = [np.mean([misfit(edge, poses) for edge in chain]) for chain in chains if chain]
     kept = weights >= _KEPT
     if ratio**2 * max(deformations, default=0.0) > _MAX_DEFORMATION_CHI2 or (
-        ties and not kept.any()
+        constraints and not kept.any()
     ):
         return None
     solved = [poses[a:b] for a, b in pairwise(begins)]
@@ -210,23 +210,31 @@ def _numbered(segment: NDArray[np.int64], drive: int) -> NDArray[np.int64]:
     return segment + (drive << 32)
 
 
-def _tied_frames(ties: Sequence[Tie], drive: int) -> list[int]:
-    ends = ((one, tie.loop) for tie in ties for one in zip(tie.drives, (0, 1), strict=True))
+def _constrained_frames(constraints: Sequence[Constraint], drive: int) -> list[int]:
+    ends = (
+        (one, constraint.loop)
+        for constraint in constraints
+        for one in zip(constraint.drives, (0, 1), strict=True)
+    )
     return sorted({(loop.first, loop.last)[end] for (number, end), loop in ends if number == drive})
 
 
-def _spaced(drives: Sequence[DrivePath], tied: Sequence[list[int]]) -> list[NDArray[np.intp]]:
-    """Return the frames of each drive that are nodes: at even distances, and where ties are."""
+def _spaced(
+    drives: Sequence[DrivePath], constrained: Sequence[list[int]]
+) -> list[NDArray[np.intp]]:
+    """Return the frames of each drive that are nodes: at even distances, and where constraints are."""
     length_m = sum(float(drive.path_m[-1]) for drive in drives)
     gap_m = max(min(drive.scale for drive in drives) * _NODE_M, 2.0 * length_m / _MAX_NODES)
-    if 2 * sum(map(len, tied)) > _MAX_NODES:
-        tied = [[] for _ in drives]
-    return [nodes_along(drive, gap_m, frames) for drive, frames in zip(drives, tied, strict=True)]
+    if 2 * sum(map(len, constrained)) > _MAX_NODES:
+        constrained = [[] for _ in drives]
+    return [
+        nodes_along(drive, gap_m, frames) for drive, frames in zip(drives, constrained, strict=True)
+    ]
 
 
-def nodes_along(drive: DrivePath, gap_m: float, tied: Sequence[int]) -> NDArray[np.intp]:
-    """Return frames at even distances along each segment, its first and last, and those tied."""
-    nodes = [np.array(tied, np.intp)]
+def nodes_along(drive: DrivePath, gap_m: float, constrained: Sequence[int]) -> NDArray[np.intp]:
+    """Return frames at even distances along each segment, its first and last, and those constrained."""
+    nodes = [np.array(constrained, np.intp)]
     if drive.segment.max() < 0:
         return np.zeros(1, np.intp)
     for number in range(int(drive.segment.max()) + 1):
@@ -246,13 +254,13 @@ def _beside(
     start: Float64,
     parts: NDArray[np.int64],
     root: int,
-    ties: Sequence[Tie],
+    constraints: Sequence[Constraint],
     edges: Sequence[PoseEdge],
 ) -> Float64:
     """Return poses of nodes with each part where its best tie to those already placed has it."""
     poses: Float64 = start.copy()
     placed = {root}
-    surest = sorted(zip(ties, edges, strict=True), key=lambda each: -each[0].loop.inliers)
+    surest = sorted(zip(constraints, edges, strict=True), key=lambda each: -each[0].loop.inliers)
     while True:
         bridges = (
             edge
@@ -270,11 +278,11 @@ def _beside(
 
 
 def _solve(
-    start: Float64, steps: list[PoseEdge], ties: list[PoseEdge], anchor: int = 0
+    start: Float64, steps: list[PoseEdge], constraints: list[PoseEdge], anchor: int = 0
 ) -> tuple[Float64, Float64]:
-    """Return poses of the nodes, of which one is fixed, and the weights of the ties."""
-    edges, poses = [*steps, *ties], start
-    worst = max((misfit(edge, start) for edge in ties), default=0.0)
+    """Return poses of the nodes, of which one is fixed, and the weights of the constraints."""
+    edges, poses = [*steps, *constraints], start
+    worst = max((misfit(edge, start) for edge in constraints), default=0.0)
     rounds = math.ceil(math.log(max(worst / _MAX_CHI2, 1.0), _EASING))
     for k in range(rounds, -1, -1):
         poses, weights = optimise_poses(poses, edges, _MAX_CHI2 * _EASING**k, anchor)
@@ -286,14 +294,14 @@ def _solve_held(
     nodes: Sequence[NDArray[np.intp]],
     start: Float64,
     steps: list[PoseEdge],
-    ties: list[PoseEdge],
+    constraints: list[PoseEdge],
     held: Held,
 ) -> tuple[Float64, Float64]:
     """Return poses and weights as `_solve`, with the survey as one more node, which is free."""
     paths = [drive.trajectory for drive in drives]
     poses = np.concatenate([start, held.T_world_survey[None]])
     for _ in range(_HELD_ROUNDS):
-        poses, weights = _solve(poses, [*steps, *held.edges(paths, nodes, poses)], ties)
+        poses, weights = _solve(poses, [*steps, *held.edges(paths, nodes, poses)], constraints)
     return poses[:-1], weights
 
 
@@ -319,11 +327,14 @@ def odometry_edges(
     return edges
 
 
-def _tie_edge(
-    tie: Tie, drives: Sequence[DrivePath], nodes: Sequence[NDArray[np.intp]], begins: Sequence[int]
+def _constraint_edge(
+    constraint: Constraint,
+    drives: Sequence[DrivePath],
+    nodes: Sequence[NDArray[np.intp]],
+    begins: Sequence[int],
 ) -> PoseEdge:
-    """Return a tie as an edge between the nodes nearest to its frames."""
-    loop, (one, other) = tie.loop, tie.drives
+    """Return a constraint as an edge between the nodes nearest to its frames."""
+    loop, (one, other) = constraint.loop, constraint.drives
     first, to_first, before_m = _to_node(drives[one], nodes[one], loop.first)
     last, to_last, after_m = _to_node(drives[other], nodes[other], loop.last)
     scale = drives[one].scale

@@ -11,7 +11,7 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.odometry.protocol import OdometryHealth
-from recon.places.closure import DrivePath, Tie, close_loops, join_drives
+from recon.places.closure import Constraint, DrivePath, close_loops, join_drives
 from recon.places.loop import Loop, agreeing_loops
 from recon.places.places import Drift, drift_over, is_possible, path_lengths
 from tests.places.conftest import INFORMATION, drifted, drive_path, true_loop
@@ -146,11 +146,11 @@ def test_a_drive_with_known_poses_keeps_its_shape(truth, odometry, known):
         for path, sure in zip(paths, known, strict=True)
     ]
     off = noise.normal(0.0, [0.02] * 3 + [0.001] * 3, (12, 6))
-    ties = [
-        Tie((0, 1), Loop(20 * k, 20 * k, se3.as_transform(step), INFORMATION, 100, 1.0))
+    constraints = [
+        Constraint((0, 1), Loop(20 * k, 20 * k, se3.as_transform(step), INFORMATION, 100, 1.0))
         for k, step in enumerate(off[: len(truth) // 20])
     ]
-    joined = join_drives(drives, ties)
+    joined = join_drives(drives, constraints)
     assert joined.kept.all()
     for path, sure, found in zip(paths, known, joined.trajectories, strict=True):
         moved = found.T_world_camera[0] @ se3.invert(path.T_world_camera[0])
@@ -158,7 +158,7 @@ def test_a_drive_with_known_poses_keeps_its_shape(truth, odometry, known):
         assert (off_m.max() < 1e-9) == sure
     apart_m = joined.trajectories[1].positions_m - truth.positions_m
     # Behind the last link only odometry says where the drive goes.
-    assert np.linalg.norm(apart_m, axis=1)[: ties[-1].loop.last].max() < 0.1
+    assert np.linalg.norm(apart_m, axis=1)[: constraints[-1].loop.last].max() < 0.1
 
 
 @pytest.mark.parametrize("count", [2, 3])

@@ -26,7 +26,7 @@ from recon.map.store.map_file import MapFile, MapViews
 from recon.map.store.session import NO_LOOPS, OPTIMISED_POSES, POSES_BEFORE_LINKS, Session
 from recon.map.store.trees import Link
 from recon.odometry.health import segment_numbers
-from recon.places.closure import DrivePath, Tie, join_drives
+from recon.places.closure import Constraint, DrivePath, join_drives
 from recon.places.detector import KnownPlaces
 from recon.places.fixes import Held
 from recon.places.loop import Loop, agreeing_loops
@@ -286,15 +286,15 @@ def _solve(
         for one, T in zip(sessions, places.values(), strict=True)
     ]
     loops = [
-        Tie((place, place), Loop(**loop))
+        Constraint((place, place), Loop(**loop))
         for place, session in enumerate(sessions)
         for loop in session.loops.get("closed", ())
     ]
-    ties = [
-        Tie((numbers.index(link.sessions[0]), numbers.index(link.sessions[1])), link.loop)
+    constraints = [
+        Constraint((numbers.index(link.sessions[0]), numbers.index(link.sessions[1])), link.loop)
         for link in links
     ]
-    joined = join_drives(drives, [*loops, *ties], _held(map_, sessions, drives))
+    joined = join_drives(drives, [*loops, *constraints], _held(map_, sessions, drives))
     if joined is None:
         return {}, []
     kept = joined.kept[len(loops) :]

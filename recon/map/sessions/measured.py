@@ -342,7 +342,7 @@ def misfit_rms_m(map_: MapFile) -> float | None:
 
 
 def doubts_of_positions(map_: MapFile) -> list[str]:
-    """Return a warning if paths that are held at measured positions are far from them still."""
+    """Return a warning if paths that are constrained by measured positions are far from them still."""
     off_m = misfit_rms_m(map_)
     extent_m = max((span_m(each.trajectory.positions_m) for each in map_.linked), default=0.0)
     if off_m is None or off_m <= LARGEST_MISFIT * extent_m:

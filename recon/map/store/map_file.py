@@ -147,9 +147,17 @@ class MapFile:
         if not (sessions := self.linked):
             return {}
         of = {session.number: segment_numbers(session.health) for session in sessions}
-        ties, first = [*_ties(sessions, self.links, of)], sessions[0].number
+        constraints, first = [*_constraints(sessions, self.links, of)], sessions[0].number
         held = {(first, int(np.bincount(of[first] + 1, minlength=2)[1:].argmax()))}
-        while more := {b for tie in ties for a, b in (tie, tie[::-1]) if a in held} - held:
+        while (
+            more := {
+                b
+                for constraint in constraints
+                for a, b in (constraint, constraint[::-1])
+                if a in held
+            }
+            - held
+        ):
             held |= more
         return {
             number: (segment >= 0) & np.isin(segment, [s for drive, s in held if drive == number])
@@ -217,7 +225,7 @@ _SURVEY: Final[_Segment] = (-1, -1)
 _FEWEST_FIXES: Final = 2  # measured positions that say where a segment is, and which way it goes
 
 
-def _ties(
+def _constraints(
     sessions: Sequence[Session], links: Sequence[Link], of: Mapping[int, Int64]
 ) -> Iterator[tuple[_Segment, _Segment]]:
     """Yield pairs of segments that loops, links and measured positions hold together."""

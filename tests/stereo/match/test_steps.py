@@ -104,5 +104,7 @@ def test_kernels_are_their_references(seed, height, width, reach, stride):
     for first, end in ((0, middle), (middle, height)):
         steps.take_votes(values, grey, alike, marked, vote, first, end, own)
     expected = take_votes_reference(values, grey, alike, marked, vote)
-    sure = np.abs(np.abs(own - np.round(own * 2) / 2)) > 1e-5  # a tie may fall to either side
+    sure = (
+        np.abs(np.abs(own - np.round(own * 2) / 2)) > 1e-5
+    )  # a constraint may fall to either side
     np.testing.assert_allclose(own[sure], expected[sure], atol=1e-5)
