@@ -41,7 +41,7 @@ def calibrate(
             "Format of that file; ros writes two, _left and _right.",
             "--format",
             "-f",
-            default="by its name, as recon audit --mend",
+            default="by its name, as recon audit --repair",
         ),
     ] = None,
     model: Annotated[
@@ -182,7 +182,7 @@ def rectify(
 @opt.takes_groups
 def audit(
     source: Annotated[Path, typer.Argument(help=opt.SOURCES_HELP)],
-    mend: Annotated[
+    repair: Annotated[
         Path | None,
         opt.option(
             "Write the rig that rows and motion show to this file: NAME.yaml is ours, NAME.yml, "
@@ -208,8 +208,8 @@ def audit(
 
     Examples:
       recon audit drive.bag --calib camchain.yaml
-      recon audit rides/today --mend mended.yaml
-      recon audit rides/today --mend camchain.yaml
+      recon audit rides/today --repair repaired.yaml
+      recon audit rides/today --repair camchain.yaml
       recon audit rides/today --out audited
     """
     with shared.one_line_errors():
@@ -220,12 +220,12 @@ def audit(
         from recon.rig.written import targets_of
         from recon.sources.registry import open_source
 
-        if mend is not None:
-            check_targets(targets_of(mend), filter(None, [shared.config]))
+        if repair is not None:
+            check_targets(targets_of(repair), filter(None, [shared.config]))
         settings = shared.settings()
         drive = open_source(source, reading.kind, settings.source)
         announce(drive, quiet=shared.quiet, verbose=verbose)
-        found = run_audit(drive, settings, mend=mend, out=out)
+        found = run_audit(drive, settings, repair=repair, out=out)
     if shared.json:
         print_json(found.summary)
         return

@@ -26,7 +26,7 @@ COMMANDS: Final = (
 """What a job can be."""
 _WITHOUT_SOURCE: Final = ("demo",)
 _NOT_OPTIONS: Final = frozenset(
-    ("--out", "--resume", "--json", "--latex", "--quiet", "--into", "--remove", "--mend",
+    ("--out", "--resume", "--json", "--latex", "--quiet", "--into", "--remove", "--repair",
      "--picture")
 )  # fmt: skip
 """A job writes into its own folder alone, and says what the batch reads."""

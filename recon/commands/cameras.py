@@ -252,7 +252,7 @@ def run_audit(
     config: ReconConfig,
     *,
     quick: bool = False,
-    mend: StrPath | None = None,
+    repair: StrPath | None = None,
     out: StrPath | None = None,
 ) -> Audit:
     """Check a recording before a long run: what `recon audit` does.
@@ -264,7 +264,7 @@ def run_audit(
         source: The recording.
         config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
         quick: A short check of a second or two, as `recon map` makes it.
-        mend: File for the rig that rows and motion show, in the format that its name asks for
+        repair: File for the rig that rows and motion show, in the format that its name asks for
             (`recon.rig.written`); None = none is written.
         out: Folder for a report with images; None = none is written.
 
@@ -274,11 +274,11 @@ def run_audit(
         ReconError: The calibration or the report cannot be written, or would replace a file of the
             recording.
     """
-    if mend is not None:
-        check_targets(targets_of(Path(mend)), source.files)
+    if repair is not None:
+        check_targets(targets_of(Path(repair)), source.files)
     audit = audit_source(source, config, quick=quick)
-    if mend is not None:
-        audit = replace(audit, corrected=correct_calibration(source, config, audit, Path(mend)))
+    if repair is not None:
+        audit = replace(audit, corrected=correct_calibration(source, config, audit, Path(repair)))
     if out is not None:
         matcher = make_matcher(config.matching.matcher, config.matching, None)
         summary = audit.summary

@@ -68,10 +68,10 @@ _TEXTS: Final = {
     "geometry: the images show too little texture, or different scenes",
     "rows": "left and right rows are not aligned: {rows.rms_px:.2f} px rms, mean "
     "{rows.mean_px:+.2f} px, spread {rows.spread_px:.2f} px; rotating the right camera by "
-    "{pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: {who}recon audit --mend FILE "
+    "{pitch:+.3f} deg pitch and {roll:+.3f} deg roll corrects this: {who}recon audit --repair FILE "
     "writes it",
     "rig": "the rig is not as calibrated: {shown}; recon map uses the rig that the motion shows, "
-    "and recon audit --mend FILE writes it",
+    "and recon audit --repair FILE writes it",
     "near": "{percent:.0f} % of the features are nearer than the disparity range covers "
     "({reach_px} px, {reach}); give the matcher an ndisp of {most}",
     "far": "half of the features are farther away than {depth}, at less than "

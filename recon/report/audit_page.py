@@ -106,7 +106,7 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
         "rows": known(
             "{epipolar_error_rms_px:.2f} px rms (mean {epipolar_error_mean_px:+.2f}, "
             "spread {epipolar_error_spread_px:.2f}, feature noise {epipolar_noise_px:.2f}); "
-            "corrected by pitch {mend_pitch_deg:+.3f}, roll {mend_roll_deg:+.3f} deg"
+            "corrected by pitch {repair_pitch_deg:+.3f}, roll {repair_roll_deg:+.3f} deg"
         ),
         "left, right": "not known"
         if swapped is None
@@ -124,8 +124,8 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
     }
     if (by_motion := summary.get("rig_by_motion")) is not None:
         lines["by its motion"] = _by_motion(by_motion)
-    if (mended := summary.get("mended")) is not None:
-        lines["mended"] = _mended(mended)
+    if (repaired := summary.get("repaired")) is not None:
+        lines["repaired"] = _repaired(repaired)
     return lines
 
 
@@ -152,10 +152,10 @@ def _depth_off(ratio: Mapping[str, float | None]) -> str:
     return f"{ratio['mean']:+.1f} ± {1.96 * ratio['sigma']:.1f} %"
 
 
-def _mended(mended: Mapping[str, Any]) -> str:
-    lens = mended.get("lens_off_px")
+def _repaired(repaired: Mapping[str, Any]) -> str:
+    lens = repaired.get("lens_off_px")
     left = "" if lens is None else f"; lenses as near as kalibr's come, {lens:.2f} px rms off"
-    return f"{', '.join(mended['files'])}: {_turned(mended)}{left}"
+    return f"{', '.join(repaired['files'])}: {_turned(repaired)}{left}"
 
 
 def _turned(found: Mapping[str, Any]) -> str:

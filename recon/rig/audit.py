@@ -77,7 +77,7 @@ class Audit:
             for f in self.findings
         ]
         summary = {"verdict": self.verdict, "findings": findings, **self.figures}
-        return summary if self.corrected is None else {**summary, "mended": self.corrected}
+        return summary if self.corrected is None else {**summary, "repaired": self.corrected}
 
 
 def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool = False) -> Audit:
@@ -181,8 +181,8 @@ def _alignment_figures(
         "epipolar_error_spread_px": alignment.spread_px,
         "epipolar_error_rms_px": alignment.rms_px,
         "epipolar_noise_px": alignment.residual_px,
-        "mend_pitch_deg": pitch_deg,
-        "mend_roll_deg": roll_deg,
+        "repair_pitch_deg": pitch_deg,
+        "repair_roll_deg": roll_deg,
     }
     if not len(disparity_px):
         return figures

@@ -75,19 +75,19 @@ def test_json_has_the_verdict_and_nothing_else_is_printed(drive, tmp_path):
     assert summary["verdict"] == "not usable"
     assert [finding["code"] for finding in summary["findings"]] == ["rows"]
     assert summary["findings"][0]["severity"] == "fatal"
-    assert summary["mend_roll_deg"] == pytest.approx(-1, abs=0.1)
+    assert summary["repair_roll_deg"] == pytest.approx(-1, abs=0.1)
     assert summary["frames"] == summary["frames_read"] == FRAMES
     assert set(summary["depth_error_m"]) == {"2", "5", "10", "20", "50"}
 
 
 def test_what_it_mends_is_a_calibration_that_makes_the_drive_good(drive, tmp_path):
     path = drives.write_kitti(*spoiled(drive, pitch_deg=0.3), tmp_path / "drive")
-    mended = tmp_path / "mended.yaml"
-    told = recon("audit", path, "--mend", mended, "--json", "--quiet")
-    assert json.loads(told.stdout)["mended"]["calibration"] == str(mended)
-    again = json.loads(recon("audit", path, "--calib", mended, "--json", "--quiet").stdout)
+    repaired = tmp_path / "repaired.yaml"
+    told = recon("audit", path, "--repair", repaired, "--json", "--quiet")
+    assert json.loads(told.stdout)["repaired"]["calibration"] == str(repaired)
+    again = json.loads(recon("audit", path, "--calib", repaired, "--json", "--quiet").stdout)
     assert again["verdict"] == "good"
     assert abs(again["epipolar_error_mean_px"]) < 0.3
     # The same file is what `recon map --calib` opens the drive with.
-    source = open_source(path, settings=SourceSettings(calibration=str(mended)))
+    source = open_source(path, settings=SourceSettings(calibration=str(repaired)))
     assert source.calibration.baseline_m == pytest.approx(drive[1].baseline_m)

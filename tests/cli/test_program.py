@@ -125,7 +125,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"command": "map drive2"}, "unknown command"),
     ({"command": ""}, "unknown command"),
     ({"source": []}, "job a: job has no source"),
-    ({"source": ["x", "--mend=/abs"]}, "source is an option"),
+    ({"source": ["x", "--repair=/abs"]}, "source is an option"),
     ({"name": "../a"}, "not a name of a folder"),
     ({"set": ["matching.window_px=9"]}, "job a: .*matching.sad.window_px"),
     ({"options": ["--no-such"]}, "job a: No such option.*no-such"),
@@ -143,7 +143,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     *(
         ({"command": command, "options": [option]}, "a job cannot have this option")
         for command, option in (
-            ("audit", "--mend=/abs.yaml"), ("evaluate occupancy", "--picture=/abs.png"),
+            ("audit", "--repair=/abs.yaml"), ("evaluate occupancy", "--picture=/abs.png"),
             ("evaluate middlebury", "--latex"),
         )
     ),

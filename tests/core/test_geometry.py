@@ -114,13 +114,13 @@ def test_angles_keep_their_precision_and_published_numbers_give_the_published_de
 def test_orthonormalising_mends_small_noise(T, noise):
     rough = T.copy()
     rough[:3, :3] += np.random.default_rng(noise).uniform(-1e-4, 1e-4, (3, 3))
-    mended = se3.orthonormalise(rough)
-    np.testing.assert_allclose(mended[:3, :3] @ mended[:3, :3].T, np.eye(3), **EXACT)
-    assert np.linalg.det(mended[:3, :3]) > 0
+    repaired = se3.orthonormalise(rough)
+    np.testing.assert_allclose(repaired[:3, :3] @ repaired[:3, :3].T, np.eye(3), **EXACT)
+    assert np.linalg.det(repaired[:3, :3]) > 0
     # The nearest rotation is no further from the noisy matrix than the one it came from.
-    gaps = [np.linalg.norm(rough[:3, :3] - R[:3, :3]) for R in (mended, T)]
+    gaps = [np.linalg.norm(rough[:3, :3] - R[:3, :3]) for R in (repaired, T)]
     assert gaps[0] <= gaps[1] + 1e-12
-    np.testing.assert_array_equal(mended[:3, 3], T[:3, 3])
+    np.testing.assert_array_equal(repaired[:3, 3], T[:3, 3])
 
 
 @given(R=ROTATIONS)

@@ -239,7 +239,7 @@ def test_a_mended_calibration_replaces_no_input_and_no_device(drive, target):
     Path("between").symlink_to("drive/image_0/000001.png")
     TARGETS[target](Path("target.yaml"))
     before = state(drive.parent)
-    command = ("audit", "drive", "--config", "config.yaml", "--mend", "target.yaml", "--quiet")
+    command = ("audit", "drive", "--config", "config.yaml", "--repair", "target.yaml", "--quiet")
     assert_refused(run(*command), "target.yaml: ")
     assert state(drive.parent) == before
 
@@ -247,7 +247,7 @@ def test_a_mended_calibration_replaces_no_input_and_no_device(drive, target):
 @pytest.mark.parametrize("name", ["drive/calib.txt", "", ".", "drive/times.txt"])
 def test_a_mended_calibration_is_a_file_of_its_own(drive, name):
     before = state(drive)
-    assert_refused(run("audit", "drive", "--mend", name, "--quiet"), name)
+    assert_refused(run("audit", "drive", "--repair", name, "--quiet"), name)
     assert state(drive) == before
 
 

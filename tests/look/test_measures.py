@@ -66,7 +66,7 @@ def test_a_mended_rig_projects_to_the_same_rows():
     left, right = features(np.random.default_rng(3), *turn)
     alignment = align_epipolar(left, right, CAMERA)
     rig = correct_rig(CAMERA, alignment.turn, np.eye(3))
-    # Where the mended calibration says that a point lies is where the turned camera saw it.
+    # Where the repaired calibration says that a point lies is where the turned camera saw it.
     xyz = np.array([[0.4, -0.3, 6.0], [-1.0, 0.8, 9.0], [2.0, 0.1, 20.0]])
     seen = xyz @ rig.T_right_left[:3, :3].T + rig.T_right_left[:3, 3]
     uv = (seen @ rig.right.matrix.T)[:, :2] / seen[:, 2:]

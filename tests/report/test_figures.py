@@ -443,8 +443,8 @@ def test_lines_of_an_audit_say_what_is_not_known():
         "depth error": "3.1 cm at 10 m, 4.2 mm at 30 m, 3 m at 90 m",
     }
     turn = {"pitch_deg": 0.1, "yaw_deg": -0.2, "roll_deg": 0.0, "focal_percent": 0.25}
-    lines = audit_page.audit_lines(summary | {"mended": {**turn, "files": ["new.yaml"]}})
-    assert re.match(r"new.yaml.* \+0.100 deg pitch, -0.200 deg yaw", lines["mended"])
+    lines = audit_page.audit_lines(summary | {"repaired": {**turn, "files": ["new.yaml"]}})
+    assert re.match(r"new.yaml.* \+0.100 deg pitch, -0.200 deg yaw", lines["repaired"])
     off = {"disparity_px": {"mean": 0.0, "sigma": 0.1, "rms": 0.1}, "depth_percent": {}}
     for fixed in (True, False):
         lines = audit_page.audit_lines(summary | {"rig_by_motion": {**turn, **off, "fixed": fixed}})

@@ -84,7 +84,7 @@ def test_rows_that_recon_map_corrects_leave_a_drive_usable_and_the_text_says_who
     (rows,) = (finding for finding in audit.findings if finding.code == "rows")
     assert (audit.verdict, rows.fatal) == (("not usable", True), ("usable", False))[frames == 36]
     assert ("recon map does so" in rows.text) == (frames == 36)
-    assert "recon audit --mend FILE writes it" in rows.text
+    assert "recon audit --repair FILE writes it" in rows.text
 
 
 @pytest.mark.parametrize("pitch_deg", [0.3, -0.3])
@@ -95,18 +95,18 @@ def test_mending_brings_a_pitch_back_under_a_third_of_a_pixel(street, tmp_path, 
 def assert_aligned(spoiled: faults.Spoiled, folder: Path) -> None:
     before = audit_source(spoiled, CONFIG)
     assert "rows" in {finding.code for finding in before.findings}
-    path = folder / "mended.yaml"
+    path = folder / "repaired.yaml"
     correct_calibration(spoiled, CONFIG, before, path)
     height_px, width_px = spoiled.take(0).left.shape[:2]
-    mended = read_calibration(path, width_px, height_px)
-    assert mended.baseline_m == pytest.approx(spoiled.camera.baseline_m, rel=1e-9)
-    after = audit_source(replace(spoiled, camera=mended), CONFIG)
+    repaired = read_calibration(path, width_px, height_px)
+    assert repaired.baseline_m == pytest.approx(spoiled.camera.baseline_m, rel=1e-9)
+    after = audit_source(replace(spoiled, camera=repaired), CONFIG)
     assert "rows" not in {finding.code for finding in after.findings}
     assert abs(after.figures["epipolar_error_mean_px"]) < 0.3
     assert after.figures["epipolar_error_rms_px"] < 0.3
     assert before.figures["epipolar_error_rms_px"] > 5 * after.figures["epipolar_error_rms_px"]
-    # Mending what is mended changes next to nothing.
-    assert abs(after.figures["mend_pitch_deg"]) < 0.02
+    # Mending what is repaired changes next to nothing.
+    assert abs(after.figures["repair_pitch_deg"]) < 0.02
 
 
 def test_a_rig_that_is_not_rectified_is_corrected_too(street, tmp_path):
@@ -130,7 +130,7 @@ def test_images_that_are_stabilised_show_no_rig(longer_street, tmp_path):
     assert [(one.code, one.fatal) for one in found] == [("stabilised", False)]
     audit = replace(audit_source(longer_street, CONFIG), findings=found)
     with pytest.raises(CalibrationError, match="moves with what is seen"):
-        correct_calibration(longer_street, CONFIG, audit, tmp_path / "mended.yaml")
+        correct_calibration(longer_street, CONFIG, audit, tmp_path / "repaired.yaml")
     assert not list(tmp_path.iterdir())
 
 
@@ -144,11 +144,11 @@ def test_a_turn_that_only_motion_shows_is_mended(
     spoiled = faults.turned(longer_street, pitch_deg, yaw_deg=yaw_deg, enlarged=enlarged)
     before = audit_source(spoiled, CONFIG)
     assert "rig" in {finding.code for finding in before.findings}
-    found = correct_calibration(spoiled, CONFIG, before, tmp_path / "mended.yaml")
+    found = correct_calibration(spoiled, CONFIG, before, tmp_path / "repaired.yaml")
     assert found["yaw_deg"] == pytest.approx(-yaw_deg, rel=0.25)
     assert found["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.15)
-    mended = read_calibration(tmp_path / "mended.yaml", 400, 136)
-    after = audit_source(replace(spoiled, camera=mended), CONFIG)
+    repaired = read_calibration(tmp_path / "repaired.yaml", 400, 136)
+    after = audit_source(replace(spoiled, camera=repaired), CONFIG)
     assert after.findings == ()
     assert after.figures["rig_by_motion"]["disparity_px"]["rms"] < 0.1
 

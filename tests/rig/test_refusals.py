@@ -93,7 +93,7 @@ def test_a_late_drive_is_paired_as_it_belongs_together_and_says_so_first(late, t
     np.testing.assert_array_equal(*poses)
     audit = audit_source(open_source(late), CONFIG)
     assert (audit.verdict, [one.code for one in audit.findings]) == ("usable", ["lag"])
-    assert_refused(run("audit", late, "--mend", tmp_path / "rig.yaml"), found)
+    assert_refused(run("audit", late, "--repair", tmp_path / "rig.yaml"), found)
     assert not (tmp_path / "rig.yaml").exists()
 
 

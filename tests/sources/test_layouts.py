@@ -398,15 +398,15 @@ def test_folders_without_pairs_or_calibration_are_refused(noise, tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["kitti", "kitti_raw", "tum", "folders"])
-@pytest.mark.parametrize("mended", [True, False])
+@pytest.mark.parametrize("repaired", [True, False])
 def test_a_rig_beside_the_calibration_of_a_drive_is_not_used_and_that_is_said(
-    noise, tmp_path, layout, mended
+    noise, tmp_path, layout, repaired
 ):
     folder = getattr(drives, f"write_{layout}")(noise, CAMERA, tmp_path)
     before = open_source(folder)
     assert before.warnings() == []
     rig = folder / "rig.yaml"
-    if mended:
+    if repaired:
         write_recon_calibration(rig, replace(CAMERA, baseline_m=0.25))
     else:
         rig.write_text("format: recon\nbaseline_m: [")
@@ -416,7 +416,7 @@ def test_a_rig_beside_the_calibration_of_a_drive_is_not_used_and_that_is_said(
     assert line.startswith(f"{rig} is not used")
     assert source.with_calibration(CAMERA).warnings() == [line]
     chosen = SourceSettings(calibration=str(rig))
-    if mended:
+    if repaired:
         assert open_source(folder, settings=chosen).calibration.baseline_m == 0.25
         assert open_source(folder, settings=chosen).warnings() == []
     else:

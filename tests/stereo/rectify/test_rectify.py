@@ -316,7 +316,7 @@ def test_rows_that_are_off_are_measured_and_said_whatever_the_exposure(row_px):
     assert found.epipolar_error_px == pytest.approx(row_px, abs=0.2)
     (line,) = features.check_inspection(found)
     assert "left and right rows are not aligned" in line
-    assert "recon audit --mend" in line
+    assert "recon audit --repair" in line
     assert f"{abs(row_px):.0f} px too {'low' if row_px > 0 else 'high'}" in line
 
 
