@@ -192,7 +192,7 @@ def _begun(
         seen = look_first(source, config, options, run)
         scene = measure_scene(seen.look.recorded, seen.rig.calibration, config)
         fitted = seen.shifted(config).at_scale(scene.scale)
-        run.settle(fitted)
+        run.write_config(fitted)
         with options.begin(run, seen.look.source, fitted) as map_:
             options.begun(run.folder)
             yield run, map_, seen, scene, fitted

@@ -1,4 +1,4 @@
-"""What every room stands on: values, geometry, errors, settings, compiled loops.
+"""What every layer stands on: values, geometry, errors, settings, compiled loops.
 
 - `values/`: the data types, checked when they are made; `geometry/se3.py`: poses;
 - `errors.py`: one tree, one line each; `settings.py`: the base of all settings;
@@ -9,6 +9,6 @@
 - `text.py`: numbers read from text and written with words and units;
 - `progress.py`: who is told how far work is; `work.py`: threads, and seconds per stage;
   `memory.py`: what the process takes, and its limit; `machine.py`: cores, and versions;
-- `shown.py`: how values show themselves, by rooms above;
+- `shown.py`: how values show themselves, by layers above;
 - `least_squares.py`: the loop of every non-linear fit.
 """

@@ -1,4 +1,4 @@
-"""What values show of themselves, by rooms above, which `recon` names when it is imported."""
+"""What values show of themselves, by layers above, which `recon` names when it is imported."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Features of visual odometry: found, followed, and found again where a motion puts them.
 
 Tracking looks for a patch as it was. From one frame to the next a patch on a near surface grows by
-half or leans, and is lost; but near features alone fix how far the camera moved. Far ones say it
+half or slants, and is lost; but near features alone fix how far the camera moved. Far ones say it
 only as well as the rig is calibrated: a quarter of a pixel is 1 % of the depth at 15 m.
 """
 

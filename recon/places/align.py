@@ -86,10 +86,10 @@ def find_motion(first: Seen, last: Seen) -> Alignment | None:
         agreeing = int(agreement(first, last, T).sum())
         if agreeing > best:
             best, T_best = agreeing, T
-    return settle(first, last, T_best) if best >= _FEWEST else None
+    return refine_motion(first, last, T_best) if best >= _FEWEST else None
 
 
-def settle(first: Seen, last: Seen, T_first_last: Float64) -> Alignment | None:
+def refine_motion(first: Seen, last: Seen, T_first_last: Float64) -> Alignment | None:
     """Fit a motion to the matches that agree with it, until these stay the same; None = too few."""
     agree = agreement(first, last, T_first_last)
     for _ in range(_ROUNDS):

@@ -13,7 +13,7 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.camera import project
-from recon.places.align import MIN_INLIERS, Alignment, Seen, find_motion, settle
+from recon.places.align import MIN_INLIERS, Alignment, Seen, find_motion, refine_motion
 from recon.places.keyframe import (
     Keyframe,
     coarse_grid,
@@ -93,7 +93,7 @@ def match_near(
     Where it is known where features should be, fewer have to be told apart.
     """
     pairs = first.guided(last, T_first_last)
-    aligned = settle(*_seen(first, last, pairs), T_first_last)
+    aligned = refine_motion(*_seen(first, last, pairs), T_first_last)
     if aligned is None or int(aligned.agree.sum()) < MIN_INLIERS:
         return None
     return pairs[aligned.agree], aligned

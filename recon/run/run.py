@@ -66,13 +66,13 @@ class Run(RunDirectory):
         super().__enter__()
         try:
             if self._config is not None:
-                self.settle(self._config)
+                self.write_config(self._config)
         except BaseException:  # such as a full disk
             self.__exit__(*sys.exc_info())
             raise
         return self
 
-    def settle(self, config: Settings) -> None:
+    def write_config(self, config: Settings) -> None:
         """Write ``config.yaml``, anew where some settings are known only now."""
         write_yaml(self.path(CONFIG), config.recorded(self.command))
 

@@ -1,6 +1,6 @@
 """Immutable data types: validated on construction, numpy only; no file access, no drawing.
 
-What a notebook shows of them is made by rooms above, on demand (`recon.core.shown`).
+What a notebook shows of them is made by layers above, on demand (`recon.core.shown`).
 """
 
 from recon.core.values.attributes import ATTRIBUTES as ATTRIBUTES

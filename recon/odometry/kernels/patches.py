@@ -1,6 +1,6 @@
-"""Patches of one image, found again in another that shows them larger, smaller or leaning.
+"""Patches of one image, found again in another that shows them larger, smaller or slanted.
 
-Where a camera drives up to a feature its patch grows, and one on the road leans too. A motion and a
+Where a camera drives up to a feature its patch grows, and one on the road is slanted, too. A motion and a
 depth say how; with the patch warped accordingly, only its place is left to be found.
 
 The reference implementation in plain numpy is `tests/odometry/kernels/test_patches.py`.

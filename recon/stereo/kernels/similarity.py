@@ -29,7 +29,7 @@ class Blend(NamedTuple):
 
 
 @kernel
-def add_unlikeness(
+def add_dissimilarity(
     left: Int32,
     right: Int32,
     width: int,

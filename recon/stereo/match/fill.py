@@ -24,7 +24,7 @@ from recon.stereo.kernels.refine import SIGMA_LARGEST_PX
 from recon.stereo.match import search as common
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.segments import SAME_SURFACE_PX, SEGMENTATIONS, fit_segments, smooth_colours
-from recon.stereo.match.steps import beyond_range, settle_steps
+from recon.stereo.match.steps import beyond_range, vote_at_steps
 
 _UNLIKELY: Final = 0.5  # below this confidence a disparity is more likely wrong than right
 _TRUSTED: Final = 0.7  # from this confidence on it speaks for or against a plane
@@ -53,7 +53,7 @@ class FillingMatcher:
         seen = self._matcher.match(pair)
         if self._reach:
             with ThreadPoolExecutor(self._threads) as pool:
-                seen = settle_steps(pair, seen, self._reach, pool)
+                seen = vote_at_steps(pair, seen, self._reach, pool)
         return fill(pair, seen, self._threads)
 
 

@@ -31,7 +31,7 @@ from recon.stereo.kernels.path_costs import (
 )
 from recon.stereo.kernels.plane_minima import PARTS
 from recon.stereo.kernels.semi_global import divided
-from recon.stereo.kernels.similarity import Blend, add_unlikeness
+from recon.stereo.kernels.similarity import Blend, add_dissimilarity
 from recon.stereo.match import search as common
 from recon.stereo.match import sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network, rows_at_once
@@ -145,7 +145,7 @@ class FineMatcher:
 def _add_learned(
     left: Int32, right: Int32, width: int, minimum: int, costs: UInt8, rows: range
 ) -> None:
-    add_unlikeness(left, right, width, minimum, _BLEND, rows.start, rows.stop, costs)
+    add_dissimilarity(left, right, width, minimum, _BLEND, rows.start, rows.stop, costs)
 
 
 def _changes(minimum: int) -> kernels.Changes:

@@ -26,7 +26,7 @@ _NEIGHBOURS_PX: Final = 5  # a reason is that of most of such a square
 _STRIPS: Final = 8  # of rows, which threads share: one strip may have all the steps
 
 
-def settle_steps(pair: RectifiedPair, seen: Disparity, reach: int, pool: Executor) -> Disparity:
+def vote_at_steps(pair: RectifiedPair, seen: Disparity, reach: int, pool: Executor) -> Disparity:
     """Return a disparity without what the image says is of the other side of a step.
 
     Within ``reach`` pixels of a step pixels vote on a disparity by how alike they look; those that

@@ -13,7 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from recon.stereo.kernels import convolution as kernels
 from recon.stereo.kernels.simd.vectors import SUMS
-from recon.stereo.kernels.similarity import TILE, Blend, add_unlikeness
+from recon.stereo.kernels.similarity import TILE, Blend, add_dissimilarity
 from recon.stereo.match.features import Describer, load_network
 
 
@@ -128,7 +128,7 @@ def test_learned_costs_equal_the_products_of_the_features(seed, width, ndisp, mi
         summed = np.minimum(costs[:, k, :width] + unlike + 0.5, 200)
         expected[1:, k, :width] = summed[1:]
     one, other = (pairs_of(view) for view in views)
-    add_unlikeness(one, other, width, minimum, blend, 1, 3, costs)
+    add_dissimilarity(one, other, width, minimum, blend, 1, 3, costs)
     assert np.abs(costs.astype(int) - expected).max() <= 1  # halves may be rounded either way
     np.testing.assert_array_equal(costs[0], expected[0])
     np.testing.assert_array_equal(costs[:, :, width:], expected[:, :, width:])

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
 from recon.stereo.kernels import steps
-from recon.stereo.match.steps import settle_steps
+from recon.stereo.match.steps import vote_at_steps
 
 HEIGHT, WIDTH, EDGE, REACH = 60, 120, 70, 5
 
@@ -19,7 +19,7 @@ def settled(values: np.ndarray, grey: np.ndarray) -> Disparity:
     pair = RectifiedPair(grey, grey, stand_in_camera(grey.shape[1], grey.shape[0]))
     seen = Disparity.from_values(values, confidence=0.9)
     with ThreadPoolExecutor(2) as pool:
-        return settle_steps(pair, seen, REACH, pool)
+        return vote_at_steps(pair, seen, REACH, pool)
 
 
 def scene(fattened: int) -> tuple[np.ndarray, np.ndarray]:
