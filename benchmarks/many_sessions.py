@@ -26,7 +26,7 @@ import psutil
 
 from recon.commands.config import load_config
 from recon.export.make import make
-from recon.export.product import Order
+from recon.export.product import ExportContext
 from recon.map.map import Map
 from recon.map.sessions.joining import join_sessions
 from recon.map.sessions.placed import place_map
@@ -67,8 +67,8 @@ def build(folder: Path, sessions: int) -> Path:
         links = [link for ends, both in pairs for link in walls.links_between(*ends, both)]
         join_sessions(map_, links)
         map_.commit()
-        order = Order(map_, place_map(map_, config), config.mesh)
-        make(order, run.content, ("cloud", "octomap", "grid"))
+        context = ExportContext(map_, place_map(map_, config), config.mesh)
+        make(context, run.content, ("cloud", "octomap", "grid"))
         record = {"T_map_world": map_.first.T_map_world.tolist()}
         run.finish({"warnings": []}, source="wall", inputs=(), record=record)
     return folder

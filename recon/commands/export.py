@@ -22,7 +22,7 @@ from recon.export.images import open_images
 from recon.export.make import PRODUCTS, check_target, known_products, make, need_rays, write_product
 from recon.export.mesh.pieces import LAYER, WHOLE
 from recon.export.pair import PAIR_CLOUD, mesh_cloud, write_surface
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath, naming, reading, resolved
 from recon.io.models.las import check_crs
@@ -116,8 +116,8 @@ def run_export(
         if survey is not None:
             with run.stage("survey"):
                 there = locate(map_, survey, images, run.threads)
-        order = Order(map_, placed, settings.mesh, formats, run.threads, there, images)
-        made = make(order, run.content, wanted, run.watch)
+        context = ExportContext(map_, placed, settings.mesh, formats, run.threads, there, images)
+        made = make(context, run.content, wanted, run.watch)
         doubts, T_map_world = map_.doubts, map_.first.T_map_world.tolist()
         figures = {
             "run": str(source),
@@ -148,7 +148,7 @@ def export_map(
     *,
     images: Sequence[StrPath] = (),
     threads: int | None = None,
-) -> Made:
+) -> ExportResult:
     """Write one product of a map to a file or a folder, without a run.
 
     Args:
@@ -189,8 +189,8 @@ def export_map(
         placed = map_.placed
     else:
         placed = place_map(opened, settings, cores)
-    order = Order(opened, placed, settings.mesh, threads=cores, images=moved)
-    made = write_product(order, product, path)
+    context = ExportContext(opened, placed, settings.mesh, threads=cores, images=moved)
+    made = write_product(context, product, path)
     return replace(made, warnings=(*opened.doubts, *made.warnings))
 
 

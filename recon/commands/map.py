@@ -31,7 +31,7 @@ from recon.core.values import (
 )
 from recon.evaluation.map_comparison import DriveErrors, compare_with_truth
 from recon.export.make import Products, make
-from recon.export.product import Order
+from recon.export.product import ExportContext
 from recon.export.trajectories import export_paths
 from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.look.findings import Finding, find_faults
@@ -136,8 +136,8 @@ def run_map(
         rig = _shown_live(mapped, source, config, run) if source.live else found
         with run.stage("cloud"):
             check_map(mapped, source.name, (*seen.look.first, *findings))
-        order = Order(map_, mapped.placed, config.mesh, threads=run.threads)
-        made = make(order, run.content, options.products, run.watch)
+        context = ExportContext(map_, mapped.placed, config.mesh, threads=run.threads)
+        made = make(context, run.content, options.products, run.watch)
         with run.stage("compare"):
             given = options.known_poses is not None
             true = found.true_path(source, config.rectification)

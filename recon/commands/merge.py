@@ -19,7 +19,7 @@ from recon.commands.map import look_first, map_drive
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, ReconError, SettingsError
 from recon.export.make import make
-from recon.export.product import Order
+from recon.export.product import ExportContext
 from recon.export.trajectories import export_sessions
 from recon.io.files import resolved
 from recon.look.rig import RefinedRig
@@ -164,8 +164,8 @@ def _make_joined(
         map_.commit()
         with run.stage("map"):
             placed = place_map(map_, settings, run.threads)
-        order = Order(map_, placed, settings.mesh, threads=run.threads)
-        made = make(order, run.content, options.products, run.watch)
+        context = ExportContext(map_, placed, settings.mesh, threads=run.threads)
+        made = make(context, run.content, options.products, run.watch)
         axes = {"T_map_world": map_.first.T_map_world.tolist()}
         summary = {**_figures(map_), **made.figures, **axes}
         summary["warnings"] = [*left_out, *_warnings(map_), *_of_rigs(map_, new), *made.warnings]

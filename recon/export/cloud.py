@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.models.npz import write_npz
 from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import write_ply_tiles
@@ -23,40 +23,40 @@ _GROWTH: Final = 1.25
 _MUCH: Final = 0.02  # fraction of the points left out without a word; a busy street has less
 
 
-def cloud_product(order: Order, path: Path) -> Made:
+def cloud_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the fused cloud, and ``removed.ply`` beside it with what moved."""
-    return export_cloud(order.placed.tiles, path, path.with_name("removed.ply"))
+    return export_cloud(context.placed.tiles, path, path.with_name("removed.ply"))
 
 
-def pcd_product(order: Order, path: Path) -> Made:
+def pcd_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the fused cloud for PCL."""
-    clouds = (tile.cloud for tile in order.placed.tiles)
-    return Made({"points": write_pcd(path, clouds)})
+    clouds = (tile.cloud for tile in context.placed.tiles)
+    return ExportResult({"points": write_pcd(path, clouds)})
 
 
-def arrays_product(order: Order, path: Path) -> Made:
+def arrays_product(context: ExportContext, path: Path) -> ExportResult:
     """Write an archive of NumPy: the fields of the fused cloud, and the paths of the drives.
 
     ``xyz`` and the other fields of `PointCloud` that the map has; and for each frame ``times_s``,
     ``T_map_camera`` (F, 4, 4), ``placed`` (whether it has a place in the map) and ``session``.
     """
-    drives = order.map.linked
+    drives = context.map.linked
     paths = [drive.T_map_world @ drive.trajectory.T_world_camera for drive in drives]
     whole: dict[str, list[NDArray[Any]]] = {
         "times_s": [drive.trajectory.timestamps_s for drive in drives],
         "T_map_camera": paths,
-        "placed": [order.map.placed[drive.number] for drive in drives],
+        "placed": [context.map.placed[drive.number] for drive in drives],
         "session": [np.full(len(drive), drive.number) for drive in drives],
     }
     points = write_npz(
         path,
-        (tile.cloud.arrays for tile in order.placed.tiles if len(tile.cloud)),
+        (tile.cloud.arrays for tile in context.placed.tiles if len(tile.cloud)),
         {name: np.concatenate(each) for name, each in whole.items()},
     )
-    return Made({"points": points})
+    return ExportResult({"points": points})
 
 
-def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
+def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> ExportResult:
     """Write the points of all tiles into a PLY file, and perhaps what was removed into another.
 
     A report shows an even sample of the cloud; all points of a small one. Frame ``map``.
@@ -68,7 +68,7 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
         moved = (tile.removed for tile in tiles)
         left_out = write_ply_tiles(removed, moved, frame="map")
     figures = {"points": points, "points_removed": left_out}
-    return Made(figures, _doubts(tiles, points, left_out), sample.cloud())
+    return ExportResult(figures, _doubts(tiles, points, left_out), sample.cloud())
 
 
 def even_sample(tiles: Tiles) -> PointCloud:

@@ -11,7 +11,7 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.camera import project
 from recon.export.images import DriveImages
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.images.image import write_image
 from recon.io.models.colmap import ColmapModel, Seen, write_colmap
 from recon.map.store.trees import loop_in
@@ -20,7 +20,7 @@ from recon.places.closure import Closure, DrivePath
 from recon.sources.source import check_source
 
 
-def colmap_product(order: Order, folder: Path) -> Made:
+def colmap_product(context: ExportContext, folder: Path) -> ExportResult:
     """Write a folder with ``images`` and ``sparse/0``, in map axes.
 
     Cameras are those of the rectified images: pinholes without distortion, the right one a baseline
@@ -28,7 +28,7 @@ def colmap_product(order: Order, folder: Path) -> Made:
     """
     images = points = 0
     with write_colmap(folder / "sparse" / "0") as model:
-        for drive in order.drives:
+        for drive in context.drives:
             check_source(drive.source, stereo=True)
             written = _Written(drive, model, first=points + 1)
             for names, pair in written.frames():
@@ -37,7 +37,7 @@ def colmap_product(order: Order, folder: Path) -> Made:
                     images += 1
             points += written.add_points()
     warnings = [] if points else ["no points in the COLMAP model: no keyframes share any"]
-    return Made({"colmap_images": images, "colmap_points": points}, warnings)
+    return ExportResult({"colmap_images": images, "colmap_points": points}, warnings)
 
 
 def _points(drive: DriveImages) -> SharedPoints:

@@ -10,7 +10,7 @@ from recon.core.errors import MappingError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Int32
 from recon.export.occupancy import Flattening
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.models.nav2 import write_nav2_costs
 from recon.map.ground.surface import GroundSurface
 from recon.map.ground.traverse import (
@@ -25,13 +25,13 @@ from recon.map.map import Map
 from recon.map.sessions.placed import PlacedMap
 
 
-def costmap_product(order: Order, path: Path) -> Made:
+def costmap_product(context: ExportContext, path: Path) -> ExportResult:
     """Write costs in Nav2's mode ``scale``, given the path of their YAML file."""
-    grid, warnings = make_costmap(order.map, order.placed)
+    grid, warnings = make_costmap(context.map, context.placed)
     write_nav2_costs(path.with_suffix(""), grid)
     named = {"free": FREE, "lethal": OCCUPIED, "unseen": UNKNOWN, "uncertain": UNSURE}
     figures = {f"costmap_{name}_cells": int((grid.cells == v).sum()) for name, v in named.items()}
-    return Made(figures, warnings, grid)
+    return ExportResult(figures, warnings, grid)
 
 
 def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str, ...]]:

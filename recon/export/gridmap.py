@@ -11,27 +11,27 @@ from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64
 from recon.export.costmap import make_costmap
 from recon.export.occupancy import grounds, make_grid
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.export.rasters import ground_slopes
 from recon.io.models.ros_bag import Message, header, pose, write_bag
 from recon.map.ground.surface import GroundSurface
 
 
-def gridmap_product(order: Order, folder: Path) -> Made:
+def gridmap_product(context: ExportContext, folder: Path) -> ExportResult:
     """Write a folder with a bag of one message: height and slope of the ground, and cells.
 
     Layers are ``elevation`` [m] and ``slope`` [rad] of the ground in the middle of a cell,
     ``occupancy`` (0 to 100) of the flat grid, and ``traversability`` (1 to 0) by the costs of the
     robot of the settings; NaN = unknown.
     """
-    flat, _, _ = make_grid(order.placed)
-    costs, warnings = make_costmap(order.map, order.placed)
+    flat, _, _ = make_grid(context.placed)
+    costs, warnings = make_costmap(context.map, context.placed)
     heights, slopes = np.full((2, *flat.cells.shape), np.nan)
     x_m, y_m = (
         origin_m + (np.arange(cells) + 0.5) * flat.resolution_m
         for origin_m, cells in zip(flat.origin_m, flat.cells.shape[::-1], strict=True)
     )
-    for bounds, ground in grounds(order.placed):
+    for bounds, ground in grounds(context.placed):
         sides = zip((y_m, x_m), bounds.low[::-1], bounds.high[::-1], strict=True)
         part = tuple(slice(*np.searchsorted(at_m, ends_m)) for at_m, *ends_m in sides)
         xy_m = np.stack(np.meshgrid(x_m[part[1]], y_m[part[0]]), axis=-1)
@@ -43,10 +43,10 @@ def gridmap_product(order: Order, folder: Path) -> Made:
         "occupancy": _known(flat),
         "traversability": 1.0 - _known(costs) / 100.0,
     }
-    time_ns = round(1e9 * float(order.map.first.trajectory.timestamps_s[0]))
+    time_ns = round(1e9 * float(context.map.first.trajectory.timestamps_s[0]))
     with write_bag(folder) as bag:
         bag.write("/grid_map", time_ns, _message(time_ns, flat, layers), kept=True)
-    return Made({"gridmap_layers": [*layers]}, warnings)
+    return ExportResult({"gridmap_layers": [*layers]}, warnings)
 
 
 def _known(grid: OccupancyGrid) -> Float64:

@@ -21,7 +21,7 @@ from recon.export.mesh.pieces import mesh_product
 from recon.export.mesh.texture import texture_product
 from recon.export.nerfstudio import nerfstudio_product
 from recon.export.occupancy import grid_product, octomap_product
-from recon.export.product import Made, Order, Product
+from recon.export.product import ExportContext, ExportResult, Product
 from recon.export.rasters import RASTERS, raster_product
 from recon.export.survey import copc_product, e57_product, las_product
 from recon.io.atomic import check_targets, writing_to
@@ -63,7 +63,7 @@ OF_A_PAIR: Final = ("cloud", "mesh")
 class Products:
     """What is left in memory of products whose files are written, by name; and warnings."""
 
-    made: Mapping[str, Made]
+    made: Mapping[str, ExportResult]
     warnings: tuple[str, ...]
 
     @property
@@ -93,34 +93,37 @@ class Products:
 
 
 def make(
-    order: Order, folder: Path, products: Sequence[str] = USUAL, watch: Stopwatch | None = None
+    context: ExportContext,
+    folder: Path,
+    products: Sequence[str] = USUAL,
+    watch: Stopwatch | None = None,
 ) -> Products:
     """Make any of `PRODUCTS` of a map, and write them into a folder, under their names.
 
     A surface that cannot be made is a warning where something else is asked for.
     """
-    made: dict[str, Made] = {}
+    made: dict[str, ExportResult] = {}
     warnings: list[str] = []
     for name in (name for name in PRODUCTS if name in products):
         stage(name)
         try:
             with (watch or Stopwatch()).stage(name):
-                made[name] = _written(order, name, folder / PRODUCTS[name].name)
+                made[name] = _written(context, name, folder / PRODUCTS[name].name)
         except MeshingError as error:
             if len(products) == 1:
                 raise
             warnings.append(f"no mesh: {error}")
         else:
             warnings += made[name].warnings
-        order.placed.tiles.config.memory.check(name)
+        context.placed.tiles.config.memory.check(name)
     return Products(made, tuple(dict.fromkeys(warnings)))  # two may say the same
 
 
-def _written(order: Order, name: str, path: Path) -> Made:
-    if PRODUCTS[name].needs_occupancy and not has_occupancy(order.map):
-        check_rays(order.map.first, order.placed.tiles.config)
+def _written(context: ExportContext, name: str, path: Path) -> ExportResult:
+    if PRODUCTS[name].needs_occupancy and not has_occupancy(context.map):
+        check_rays(context.map.first, context.placed.tiles.config)
     path.parent.mkdir(parents=True, exist_ok=True)
-    return PRODUCTS[name].write(order, path)
+    return PRODUCTS[name].write(context, path)
 
 
 def check_target(name: str, path: Path, inputs: Iterable[Path]) -> None:
@@ -137,7 +140,7 @@ def check_target(name: str, path: Path, inputs: Iterable[Path]) -> None:
         raise OutputError(what, where=path, expected=expected)
 
 
-def write_product(order: Order, name: str, path: Path) -> Made:
+def write_product(context: ExportContext, name: str, path: Path) -> ExportResult:
     """Write a product to a file or a folder of any name: all of it, or nothing.
 
     What it has beside it in a run, besides files that belong to it, is not kept.
@@ -148,7 +151,7 @@ def write_product(order: Order, name: str, path: Path) -> Made:
         path.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
             staged = (Path(folder) / product.name).with_name(stem + product.suffix)
-            made = _written(replace(order, formats=(end[1:].lower(),)), name, staged)
+            made = _written(replace(context, formats=(end[1:].lower(),)), name, staged)
             for one in (*product.parts, end):
                 file = staged.with_name(stem + one.lower())
                 if not file.exists():  # the largest OctoMaps are not written

@@ -15,7 +15,7 @@ from recon.core.values.arrays import Float64, UInt8
 from recon.export.cloud import even_sample
 from recon.export.images import DriveImages
 from recon.export.occupancy import make_grid
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
 from recon.io.models.ros_bag import Message, RosBag, header, points, pose, write_bag
@@ -27,29 +27,29 @@ from recon.places.places import spread_over
 _LAYOUT: Final = Path(__file__).with_name("foxglove.json")
 
 
-def mcap_product(order: Order, folder: Path) -> Made:
+def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
     """Write a folder with a bag: transforms, odometry, what each frame saw, cloud, grid, images.
 
     Images are there if they can be read again. Beside it is a layout for Foxglove. Coordinates of
     a survey are a frame, ``survey``, in which that of the map lies.
     """
     warnings = []
-    grid, height_m, _ = make_grid(order.placed)
+    grid, height_m, _ = make_grid(context.placed)
     images: dict[int, DriveImages] = {}
     try:
-        images = {one.session.number: one for one in order.drives}
+        images = {one.session.number: one for one in context.drives}
     except ReconError as error:
-        if order.images:
+        if context.images:
             raise
         warnings.append(f"no images in the bag: {error}")
-    drives = [_Drive(order, session, height_m) for session in order.map.linked]
-    fixed = [] if order.survey is None else [("survey", "map", order.T_survey_map)]
+    drives = [_Drive(context, session, height_m) for session in context.map.linked]
+    fixed = [] if context.survey is None else [("survey", "map", context.T_survey_map)]
     fixed += [edge for drive in drives for edge in drive.mounted()]
     start_ns, frames = min(drive.times_ns[0] for drive in drives), 0
     with write_bag(folder) as bag:
         bag.write("/tf_static", start_ns, _transforms(start_ns, fixed), kept=True)
         bag.write("/map/grid", start_ns, _grid(start_ns, grid), kept=True)
-        cloud = points(header("map", start_ns), even_sample(order.placed.tiles))
+        cloud = points(header("map", start_ns), even_sample(context.placed.tiles))
         bag.write("/map/cloud", start_ns, cloud, kept=True)
         for drive in drives:
             for frame, views in drive.frames(images.get(drive.session.number)):
@@ -57,7 +57,7 @@ def mcap_product(order: Order, folder: Path) -> Made:
                 frames += 1
     layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/", drives[0].name)
     write_text(folder / "foxglove.json", layout)
-    return Made({"bag_frames": frames}, warnings)
+    return ExportResult({"bag_frames": frames}, warnings)
 
 
 def _transforms(time_ns: int, edges: Sequence[tuple[str, str, Float64]]) -> Message:
@@ -81,11 +81,11 @@ def _grid(time_ns: int, grid: OccupancyGrid) -> Message:
 class _Drive:
     """What is written of a drive, by frame."""
 
-    def __init__(self, order: Order, session: Session, height_m: float | None) -> None:
-        self.session, self.placed = session, order.map.placed[session.number]
+    def __init__(self, context: ExportContext, session: Session, height_m: float | None) -> None:
+        self.session, self.placed = session, context.map.placed[session.number]
         # Of its topics and frames, with a slash.
-        self.name = f"drive{session.number}/" if len(order.map.linked) > 1 else ""
-        self._T_base_camera = base_axes(order.map.first.T_map_world, height_m)
+        self.name = f"drive{session.number}/" if len(context.map.linked) > 1 else ""
+        self._T_base_camera = base_axes(context.map.first.T_map_world, height_m)
         path = session.trajectory
         if not (path.timestamps_s[0] >= 0.0 and path.timestamps_s[-1] < 2.0**31):
             what, got = "times of the frames do not fit into a bag", f"{path.timestamps_s[0]:g} s"

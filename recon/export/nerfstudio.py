@@ -21,7 +21,7 @@ from recon.core.values.arrays import Bool, Float32, Int64
 from recon.core.values.camera import project
 from recon.export.cloud import even_sample
 from recon.export.images import DriveImages
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.fields import write_json
 from recon.io.images.image import write_image
 from recon.io.models.colmap import PIXEL_CENTRE
@@ -36,25 +36,25 @@ _NAMES: Final = {"images": "file_path", "depths": "depth_file_path", "masks": "m
 _POINTS: Final = "sparse_pc.ply"
 
 
-def nerfstudio_product(order: Order, folder: Path) -> Made:
+def nerfstudio_product(context: ExportContext, folder: Path) -> ExportResult:
     """Write a folder with ``transforms.json`` and what it names, in map axes.
 
     Frames are left images; all are matched again, as they were mapped, for their depth.
     """
-    drives, moved = order.drives, _moved_cells(order.placed.tiles)
+    drives, moved = context.drives, _moved_cells(context.placed.tiles)
     whole = all(drive.rectifier.valid is None or drive.rectifier.valid.all() for drive in drives)
     # All frames have a mask, or none: readers count them.
     masked, frames = None if whole and not len(moved) else moved, []
     for drive in drives:
         # Of one drive it is said once; else each frame says its own.
         camera = {} if len(drives) == 1 else _intrinsics(drive.session.camera)
-        for frame, images in _frames(order, drive, masked):
+        for frame, images in _frames(context, drive, masked):
             named = {_NAMES[kind]: f"{kind}/{drive.file('left', frame)}" for kind in images}
             for image, name in zip(images.values(), named.values(), strict=True):
                 write_image(folder / name, image)
             pose = drive.T_map_camera[frame] @ _OPENGL
             frames.append({**named, "transform_matrix": pose.tolist(), **camera})
-    write_ply(folder / _POINTS, even_sample(order.placed.tiles))
+    write_ply(folder / _POINTS, even_sample(context.placed.tiles))
     content = {
         "camera_model": "OPENCV",
         **(_intrinsics(drives[0].session.camera) if len(drives) == 1 else {}),
@@ -63,7 +63,7 @@ def nerfstudio_product(order: Order, folder: Path) -> Made:
         "frames": frames,
     }
     write_json(folder / "transforms.json", content)
-    return Made({"nerfstudio_frames": len(frames)})
+    return ExportResult({"nerfstudio_frames": len(frames)})
 
 
 def _intrinsics(camera: RectifiedCamera) -> dict[str, float]:
@@ -74,11 +74,11 @@ def _intrinsics(camera: RectifiedCamera) -> dict[str, float]:
 
 
 def _frames(
-    order: Order, drive: DriveImages, moved: Int64 | None
+    context: ExportContext, drive: DriveImages, moved: Int64 | None
 ) -> Iterator[tuple[int, dict[str, NDArray[Any]]]]:
     """Yield number, image, depth [mm] and perhaps mask of each frame."""
-    settings, voxel_m = settings_of(drive.session), order.placed.tiles.config.fusion.voxel_m
-    reconstructor = FrameReconstructor(drive.rig, settings, threads=order.threads)
+    settings, voxel_m = settings_of(drive.session), context.placed.tiles.config.fusion.voxel_m
+    reconstructor = FrameReconstructor(drive.rig, settings, threads=context.threads)
     for frame, pair in drive.pairs():
         rectified, disparity = reconstructor.match(pair)
         xyz = back_project(disparity, rectified, settings.cloud, normals=False).xyz

@@ -17,7 +17,7 @@ from recon.core.text import metres
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64, Int32
 from recon.core.values.grid import log_odds
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.models.nav2 import write_nav2
 from recon.io.models.octomap import write_octomap_tiles
 from recon.map.builders import MIN_PROBABILITY
@@ -45,9 +45,9 @@ _MARGIN_M: Final = 5.0
 MadeGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
 
 
-def grid_product(order: Order, path: Path) -> Made:
+def grid_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the flat grid as Nav2 reads it, given the path of its YAML file."""
-    grid, height_m, warnings = make_grid(order.placed)
+    grid, height_m, warnings = make_grid(context.placed)
     write_nav2(path.with_suffix(""), grid)
     rows, columns = grid.cells.shape
     figures = {
@@ -57,9 +57,9 @@ def grid_product(order: Order, path: Path) -> Made:
         "occupied_cells": int((grid.cells == OCCUPIED).sum()),
         "free_cells": int((grid.cells == FREE).sum()),
         "camera_height_m": height_m,
-        "T_base_camera": base_axes(order.map.first.T_map_world, height_m).tolist(),
+        "T_base_camera": base_axes(context.map.first.T_map_world, height_m).tolist(),
     }
-    return Made(figures, warnings, grid)
+    return ExportResult(figures, warnings, grid)
 
 
 def make_grid(placed: PlacedMap) -> MadeGrid:
@@ -257,15 +257,15 @@ def _paste(
     cells[y0:y1, x0:x1] = part.cells[v0:v1, u0:u1]
 
 
-def octomap_product(order: Order, path: Path) -> Made:
+def octomap_product(context: ExportContext, path: Path) -> ExportResult:
     """Write OctoMaps ``.bt`` and ``.ot`` with the voxels that are occupied or free.
 
     The figure is the number of observed voxels, undecided ones included. A map may be too large.
     """
-    tiles, stem, warnings = order.placed.tiles, path.with_suffix(""), []
+    tiles, stem, warnings = context.placed.tiles, path.with_suffix(""), []
     known = (drop_undecided(tile.voxels) for tile in tiles)
     try:
         write_octomap_tiles(stem, known, tiles.edge_cells.bit_length() - 1, tiles.resolution_m)
     except MappingError as error:
         warnings.append(f"no OctoMap: {error}")
-    return Made({"voxels": sum(len(tile.voxels) for tile in tiles)}, warnings)
+    return ExportResult({"voxels": sum(len(tile.voxels) for tile in tiles)}, warnings)

@@ -20,7 +20,7 @@ from recon.map.sessions.placed import PlacedMap
 
 
 @dataclass(frozen=True, eq=False)
-class Order:
+class ExportContext:
     """A map with its drives in tiles, and how its products are wanted."""
 
     map: Map
@@ -49,7 +49,7 @@ class Order:
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class ExportResult:
     """What is left of a written product: figures of the summary, warnings, what a report shows."""
 
     figures: dict[str, Any]
@@ -62,7 +62,7 @@ class Product:
     """A kind of file, or of folder."""
 
     name: str  # of the file, or of the folder, in that of a run
-    write: Callable[[Order, Path], Made]  # to a path with the suffix of the name
+    write: Callable[[ExportContext, Path], ExportResult]  # to a path with the suffix of the name
     others: tuple[str, ...] = ()  # other suffixes, of which each can be asked for
     parts: tuple[str, ...] = ()  # suffixes of the files beside it that belong to it
     needs_occupancy: bool = False  # whether it is made of what is free and occupied

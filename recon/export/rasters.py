@@ -17,36 +17,36 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.values import UNKNOWN, PointCloud
 from recon.core.values.arrays import Bool, Float64, Int64
 from recon.export.occupancy import grounds, make_grid
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.models.geotiff import RasterFile, RasterPlace, write_geotiff
 from recon.map.ground.surface import GroundSurface
 
 _ROWS: Final = 256  # of a raster at a time
 _CORNERS: Final = np.array([*product((0.0, 1.0), repeat=2)])
-Fill = Callable[[Order, RasterFile, Float64], None]
+Fill = Callable[[ExportContext, RasterFile, Float64], None]
 
 
-def raster_product(name: str) -> Callable[[Order, Path], Made]:
+def raster_product(name: str) -> Callable[[ExportContext, Path], ExportResult]:
     """Return what writes one of `RASTERS`, perhaps in survey coordinates."""
     fill, colours = RASTERS[name]
 
-    def write(order: Order, path: Path) -> Made:
-        T_file_map = order.T_survey_map
-        place = _place(order, T_file_map)
-        with write_geotiff(path, place, colours=colours, crs=order.crs) as file:
-            fill(order, file, T_file_map)
-        return Made({f"{name}_size": [place.columns, place.rows]})
+    def write(context: ExportContext, path: Path) -> ExportResult:
+        T_file_map = context.T_survey_map
+        place = _place(context, T_file_map)
+        with write_geotiff(path, place, colours=colours, crs=context.crs) as file:
+            fill(context, file, T_file_map)
+        return ExportResult({f"{name}_size": [place.columns, place.rows]})
 
     return write
 
 
-def _place(order: Order, T_file_map: Float64) -> RasterPlace:
+def _place(context: ExportContext, T_file_map: Float64) -> RasterPlace:
     """Return the cells that have all points, as large as those of the grid."""
-    clouds = (tile.cloud.xyz.astype(np.float64) for tile in order.placed.tiles)
+    clouds = (tile.cloud.xyz.astype(np.float64) for tile in context.placed.tiles)
     seen = [apply(T_file_map, xyz)[:, :2] for xyz in clouds if len(xyz)]
     if not seen:
         raise MappingError("the map is empty: there is nothing to see from above")
-    cell_m = order.placed.tiles.resolution_m
+    cell_m = context.placed.tiles.resolution_m
     west, south = np.floor(np.min([xy.min(axis=0) for xy in seen], axis=0) / cell_m).astype(int)
     east, north = np.floor(np.max([xy.max(axis=0) for xy in seen], axis=0) / cell_m).astype(int) + 1
     return RasterPlace(cell_m, int(west), int(north), int(east - west), int(north - south))
@@ -66,8 +66,8 @@ class _Seen(NamedTuple):
         return np.asarray(self.top >= 0)
 
 
-def _seen(order: Order, place: RasterPlace, T_file_map: Float64) -> Iterator[_Seen]:
-    for tile in order.placed.tiles:
+def _seen(context: ExportContext, place: RasterPlace, T_file_map: Float64) -> Iterator[_Seen]:
+    for tile in context.placed.tiles:
         cloud = tile.cloud
         if not len(cloud):
             continue
@@ -81,17 +81,17 @@ def _seen(order: Order, place: RasterPlace, T_file_map: Float64) -> Iterator[_Se
         yield _Seen(*first, top, cloud, xyz[:, 2])
 
 
-def _surface_heights(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+def _surface_heights(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
     """Write the height of the highest point of each cell."""
-    for one in _seen(order, file.place, T_file_map):
+    for one in _seen(context, file.place, T_file_map):
         before = file.read(one.row, one.column, one.top.shape)
         heights = np.where(one.known, one.height_m[one.top], np.nan).astype(np.float32)
         file.write(one.row, one.column, np.fmax(before, heights))
 
 
-def _surface_colours(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+def _surface_colours(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
     """Write the colour of the highest point of each cell; where tiles meet, of the first tile."""
-    for one in _seen(order, file.place, T_file_map):
+    for one in _seen(context, file.place, T_file_map):
         if one.cloud.rgb is None:
             raise MappingError("the points of the map have no colours")
         before = file.read(one.row, one.column, one.top.shape)
@@ -101,19 +101,19 @@ def _surface_colours(order: Order, file: RasterFile, T_file_map: Float64) -> Non
         file.write(one.row, one.column, np.where(before[3] > 0, before, colours))
 
 
-def _ground_heights(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+def _ground_heights(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
     """Write the height of the ground in the middle of each cell."""
 
     def heights(ground: GroundSurface, xy_m: Float64) -> Float64:
         xyz = np.column_stack([xy_m, ground.height_at(xy_m)])
         return np.asarray(apply(T_file_map, xyz)[:, 2])
 
-    _write_ground(order, file, T_file_map, heights)
+    _write_ground(context, file, T_file_map, heights)
 
 
-def _ground_slopes(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+def _ground_slopes(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
     """Write by how many degrees the ground is inclined."""
-    _write_ground(order, file, T_file_map, lambda *where: np.degrees(ground_slopes(*where)))
+    _write_ground(context, file, T_file_map, lambda *where: np.degrees(ground_slopes(*where)))
 
 
 def ground_slopes(ground: GroundSurface, xy_m: Float64) -> Float64:
@@ -123,9 +123,9 @@ def ground_slopes(ground: GroundSurface, xy_m: Float64) -> Float64:
     return np.asarray(np.arctan(np.hypot(*rises) / (2 * ground.cell_m)))
 
 
-def _occupancy(order: Order, file: RasterFile, T_file_map: Float64) -> None:
+def _occupancy(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
     """Write what the flat grid has at the middle of each cell: 0 = free, 100 = occupied."""
-    grid, T_map_file, place = make_grid(order.placed)[0], invert(T_file_map), file.place
+    grid, T_map_file, place = make_grid(context.placed)[0], invert(T_file_map), file.place
     for row in range(0, place.rows, _ROWS):
         shape = min(_ROWS, place.rows - row), place.columns
         middles = place.centres(row, 0, shape).reshape(-1, 2)
@@ -140,14 +140,14 @@ def _occupancy(order: Order, file: RasterFile, T_file_map: Float64) -> None:
 
 
 def _write_ground(
-    order: Order,
+    context: ExportContext,
     file: RasterFile,
     T_file_map: Float64,
     measure: Callable[[GroundSurface, Float64], Float64],
 ) -> None:
     """Write what is measured of the ground of each tile at the middles of cells."""
     T_map_file, place = invert(T_file_map), file.place
-    for bounds, ground in grounds(order.placed):
+    for bounds, ground in grounds(context.placed):
         low, high = np.array(bounds.low), np.array(bounds.high)
         corners = np.pad(low + _CORNERS * (high - low), ((0, 0), (0, 1)))
         row, column = place.cells_of(apply(T_file_map, corners)[:, :2])

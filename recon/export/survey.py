@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool
 from recon.export.occupancy import GROUND_RATIO, grounds
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
 from recon.io.models.las import AreGround, write_las
@@ -19,24 +19,26 @@ from recon.map.ground.surface import MAX_TILT_DEG, WINDOW_M, GroundSurface
 from recon.map.sessions.placed import PlacedMap
 
 
-def las_product(order: Order, path: Path, write: Callable[..., int] = write_las) -> Made:
+def las_product(
+    context: ExportContext, path: Path, write: Callable[..., int] = write_las
+) -> ExportResult:
     """Write the cloud as LAS or LAZ, with the ground as a class, perhaps where a survey says."""
-    clouds = (tile.cloud for tile in order.placed.tiles)
+    clouds = (tile.cloud for tile in context.placed.tiles)
     # A hundredth of a voxel, as a decimal: a millimetre on a road.
-    step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
-    how = {"step_m": step_m, "ground": _ground_of(order.placed)}
-    return Made({"points": write(path, clouds, order.T_survey_map, order.crs, **how)})
+    step_m = 10.0 ** math.floor(math.log10(context.placed.tiles.config.fusion.voxel_m) - 2.0)
+    how = {"step_m": step_m, "ground": _ground_of(context.placed)}
+    return ExportResult({"points": write(path, clouds, context.T_survey_map, context.crs, **how)})
 
 
-def copc_product(order: Order, path: Path) -> Made:
+def copc_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the cloud as COPC, as `las_product` does."""
-    return las_product(order, path, write_copc)
+    return las_product(context, path, write_copc)
 
 
-def e57_product(order: Order, path: Path) -> Made:
+def e57_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the cloud as E57, perhaps where a survey says."""
-    clouds = (tile.cloud for tile in order.placed.tiles)
-    return Made({"points": write_e57(path, clouds, order.T_survey_map, order.crs)})
+    clouds = (tile.cloud for tile in context.placed.tiles)
+    return ExportResult({"points": write_e57(path, clouds, context.T_survey_map, context.crs)})
 
 
 def _ground_of(placed: PlacedMap) -> AreGround:

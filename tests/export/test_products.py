@@ -17,7 +17,7 @@ from recon.export.cloud import CloudSample
 from recon.export.costmap import make_costmap
 from recon.export.make import Products, make
 from recon.export.occupancy import make_grid
-from recon.export.product import Order
+from recon.export.product import ExportContext
 from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply, write_ply_tiles
 from recon.map.drive import mapper
@@ -41,8 +41,8 @@ def mapped():
 
 
 def write_products(mapped: MappedSequence, run: Run) -> Products:
-    order = Order(mapped.map, mapped.placed, load_config().mesh)
-    return make(order, run.content, ("cloud", "octomap", "grid"))
+    context = ExportContext(mapped.map, mapped.placed, load_config().mesh)
+    return make(context, run.content, ("cloud", "octomap", "grid"))
 
 
 @pytest.fixture
@@ -220,8 +220,8 @@ def test_tiles_in_one_file_are_read_as_one_cloud_and_an_error_leaves_none(tmp_pa
 
 
 def test_a_costmap_of_tiles_lies_on_the_grid_and_has_the_robot_in_it(mapped, folder):
-    order = Order(mapped.map, mapped.placed, load_config().mesh)
-    made = make(order, folder.content, ("costmap", "grid"))
+    context = ExportContext(mapped.map, mapped.placed, load_config().mesh)
+    made = make(context, folder.content, ("costmap", "grid"))
     costs, grid = made.made["costmap"].value, made.grid
     assert (costs.cells.shape, costs.origin_m) == (grid.cells.shape, grid.origin_m)
     # What is free for a robot of the usual height is free in the grid, too.

@@ -9,7 +9,7 @@ import pytest
 import recon
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError, SourceError
 from recon.export.make import PRODUCTS, make
-from recon.export.product import Order
+from recon.export.product import ExportContext
 from recon.io.models import nav2
 from recon.io.models.octomap import read_octomap
 from tests.map import walls
@@ -50,8 +50,8 @@ def test_every_product_is_what_a_run_has_and_nothing_else(mapped, tmp_path, name
     pytest.importorskip(TOOLS.get(name, "numpy"))
     product = PRODUCTS[name]
     formats = (product.suffix.lstrip("."),)
-    order = Order(mapped.map, mapped.placed, CONFIG.mesh, formats=formats)
-    made = make(order, tmp_path / "run", [name])
+    context = ExportContext(mapped.map, mapped.placed, CONFIG.mesh, formats=formats)
+    made = make(context, tmp_path / "run", [name])
     path = tmp_path / "there" / Path(product.name).name
     found = recon.export_map(mapped, name, path, threads=1)
     assert (found.figures, [*found.warnings]) == (

@@ -10,7 +10,7 @@ import pytest
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import ReconError, SettingsError
 from recon.export.make import make
-from recon.export.product import Order
+from recon.export.product import ExportContext
 from recon.io.cameras.calibration import read_calibration
 from recon.io.files import SMALL_FILE_BYTES
 from recon.map.drive.sequence import map_sequence
@@ -235,8 +235,8 @@ def test_a_setting_at_its_bound_gives_a_map_or_one_line(number, end, street, tmp
             config = load_config(None, overrides)
             with Run("map", tmp_path / "out", config) as made:
                 mapped = map_sequence(street, config)
-                order = Order(mapped.map, mapped.placed, made, config.mesh)
-                make(order, ("cloud", "octomap", "grid"))
+                context = ExportContext(mapped.map, mapped.placed, made, config.mesh)
+                make(context, ("cloud", "octomap", "grid"))
         except ReconError as error:
             line = str(error)
     assert "\n" not in line

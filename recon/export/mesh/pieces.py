@@ -33,7 +33,7 @@ from recon.export.mesh.cut import (
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.voxels import reconstruct_map_surface
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.map.cut import Rectangle
@@ -67,30 +67,30 @@ class Border(NamedTuple):
     components: Int64
 
 
-def mesh_product(order: Order, path: Path) -> Made:
+def mesh_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the surface, with other formats, its pieces and a MeshLab project beside it.
 
     The cloud of the project is that of the folder two levels up, else it is made. With a survey,
     ``survey/`` has the surface in its coordinates.
     """
-    tiles, cloud = order.placed.tiles, path.parents[1] / "map" / "cloud.ply"
+    tiles, cloud = context.placed.tiles, path.parents[1] / "map" / "cloud.ply"
     if not cloud.is_file():
         cloud = path.with_name(Path(LAYER).name)
         export_cloud(tiles, cloud)
     # Each piece being meshed takes memory of its own.
-    at_once = order.threads if tiles.config.memory.limit_mb is None else 1
-    made = export_mesh(tiles, order.mesh, path, cloud, at_once)
-    for suffix in dict.fromkeys(order.formats):
+    at_once = context.threads if tiles.config.memory.limit_mb is None else 1
+    made = export_mesh(tiles, context.mesh, path, cloud, at_once)
+    for suffix in dict.fromkeys(context.formats):
         if suffix != "ply":
             write_mesh(path.with_suffix(f".{suffix}"), read_mesh(path), "map")
     warnings = [*made.warnings]
-    if order.mesh.free_space and not has_occupancy(order.map):
+    if context.mesh.free_space and not has_occupancy(context.map):
         warnings.append("the map kept no rays: which faces lie in free space is not known")
     small = made.figures["faces"] <= SAMPLE_FACES
-    mesh = read_mesh(path) if small or order.survey is not None else None
+    mesh = read_mesh(path) if small or context.survey is not None else None
     survey = path.with_name("survey")
-    there = {} if mesh is None else write_surveyed(order, mesh, survey, order.formats)
-    return Made({**made.figures, **there}, warnings, mesh if small else None)
+    there = {} if mesh is None else write_surveyed(context, mesh, survey, context.formats)
+    return ExportResult({**made.figures, **there}, warnings, mesh if small else None)
 
 
 def export_mesh(
@@ -99,7 +99,7 @@ def export_mesh(
     path: Path,
     cloud: Path,
     threads: int | None = None,
-) -> Made:
+) -> ExportResult:
     """Write the surface of a map, its pieces if there are several, and a MeshLab project.
 
     Args:
@@ -124,7 +124,7 @@ def export_mesh(
     write_mlp(path.with_suffix(".mlp"), {**layers, "cloud": cloud}, "map")
     vertices, faces = (sum(numbers) for numbers in [*zip(*pieces, strict=True)][1:])
     figures = {"points": points.total(), "vertices": vertices, "faces": faces}
-    return Made({**figures, "tiles": len(pieces)}, warnings)
+    return ExportResult({**figures, "tiles": len(pieces)}, warnings)
 
 
 def _count(tiles: Tiles, settings: MeshSettings) -> Counter[PieceKey]:

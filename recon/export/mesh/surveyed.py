@@ -14,7 +14,7 @@ import numpy as np
 
 from recon.core.geometry.se3 import apply, rotate
 from recon.core.values import TriangleMesh
-from recon.export.product import Order
+from recon.export.product import ExportContext
 from recon.io.atomic import write_text
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import write_mesh
@@ -23,7 +23,7 @@ _ROUND_M: Final = 100.0
 
 
 def write_surveyed(
-    order: Order, mesh: TriangleMesh, folder: Path, formats: Sequence[str]
+    context: ExportContext, mesh: TriangleMesh, folder: Path, formats: Sequence[str]
 ) -> dict[str, Any]:
     """Write a mesh, map axes, once more into a folder; return its figures.
 
@@ -31,9 +31,9 @@ def write_surveyed(
     hundreds of metres to the east and north; ``mesh.prj`` the coordinate system, if it is known.
     Without a survey nothing is written.
     """
-    if order.survey is None:
+    if context.survey is None:
         return {}
-    T_survey_map = order.T_survey_map
+    T_survey_map = context.T_survey_map
     offset_m = np.array([*(np.floor(T_survey_map[:2, 3] / _ROUND_M) * _ROUND_M), 0.0])
     T_mesh_map = T_survey_map.copy()
     T_mesh_map[:3, 3] -= offset_m
@@ -47,7 +47,7 @@ def write_surveyed(
         write_mesh(folder / f"mesh.{suffix}", moved, "map")
     text = " ".join(f"{metres:.0f}" for metres in offset_m)
     write_text(folder / "offset.xyz", f"{text}\n")
-    if order.crs is not None:
-        wkt = check_crs(order.crs).to_wkt("WKT1_ESRI")
+    if context.crs is not None:
+        wkt = check_crs(context.crs).to_wkt("WKT1_ESRI")
         write_text(folder / "mesh.prj", f"{wkt}\n")
     return {"mesh_offset_m": offset_m.tolist()}

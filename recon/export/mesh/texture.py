@@ -18,7 +18,7 @@ from recon.export.mesh.charts import make_atlas
 from recon.export.mesh.pieces import SAMPLE_FACES, WHOLE, mesh_product
 from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.views import BestViews, PosedImage, paint
-from recon.export.product import Made, Order
+from recon.export.product import ExportContext, ExportResult
 from recon.io.images.image import write_image
 from recon.io.models.mesh import read_mesh, write_mesh
 from recon.io.models.mlp import Photo, write_mlp
@@ -30,31 +30,31 @@ Views = Callable[[], Iterable[PosedImage]]
 """Gives the same images again each time it is called, one in memory at a time."""
 
 
-def texture_product(order: Order, path: Path) -> Made:
+def texture_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the surface and its picture, and beside it a MeshLab project with the keyframes.
 
     The formats are those of the mesh that hold a texture, GLB if there is none. The surface is that
     of the folder two levels up, which is made if it is not there.
     """
-    drives, whole = order.drives, path.parents[1] / WHOLE
-    made = None if whole.is_file() else mesh_product(order, whole)
+    drives, whole = context.drives, path.parents[1] / WHOLE
+    made = None if whole.is_file() else mesh_product(context, whole)
     mesh = read_mesh(whole)
     if len(mesh.faces) > SAMPLE_FACES:
         what, hint = "the mesh is too large for one texture", "--set mesh.target_faces=1000000"
         raise MeshingError(what, got=counted(len(mesh.faces), "face"), hint=hint)
-    edge_m, settings = order.placed.tiles.config.fusion.voxel_m, order.mesh
+    edge_m, settings = context.placed.tiles.config.fusion.voxel_m, context.mesh
     range_m = max(fusion_range_m(d.session.camera, settings_of(d.session).fusion) for d in drives)
     textured, figures = textured_mesh(
         mesh, lambda: posed_images(drives), edge_m, range_m, settings.texture_px
     )
-    chosen = [name for name in order.formats if name in _WITH_TEXTURE]
+    chosen = [name for name in context.formats if name in _WITH_TEXTURE]
     named = [name for name in chosen if chosen != ["ply"]] or ["glb"]
     for suffix in dict.fromkeys(named):
         write_mesh(path.with_suffix(f".{suffix}"), textured, "map")
     photos = [*_photos(path.with_name("images"), drives)]
     write_mlp(path.with_suffix(".mlp"), {"mesh": whole}, "map", photos)
-    there = write_surveyed(order, textured, path.with_name("survey"), named)
-    return Made({**figures, **there}, () if made is None else made.warnings)
+    there = write_surveyed(context, textured, path.with_name("survey"), named)
+    return ExportResult({**figures, **there}, () if made is None else made.warnings)
 
 
 def textured_mesh(
