@@ -23,7 +23,7 @@ from recon.report.calibration_page import write_calibration_page, write_epipolar
 from recon.rig.audit import Audit, audit_source, correct_calibration
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
 from recon.rig.calibrate.bootstrap import measure_spread
-from recon.rig.calibrate.result import CalibrationRun, describe_calibration, write_calibration
+from recon.rig.calibrate.result import CalibrationResult, describe_calibration, write_calibration
 from recon.rig.calibrate.stereo import calibrate_stereo
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
 from recon.rig.capture import (
@@ -35,7 +35,7 @@ from recon.rig.capture import (
     write_pairs,
 )
 from recon.rig.rectification import (
-    RectifyRun,
+    RectifyResult,
     measure_epipolar,
     plan_by_calibration,
     plan_by_features,
@@ -60,7 +60,7 @@ def run_calibrate(
     form: CalibrationForm | None = None,
     out: Path | None = None,
     threads: int | None = None,
-) -> CalibrationRun:
+) -> CalibrationResult:
     """Calibrate a rig from images of a board: what `recon calibrate` does.
 
     Still views are picked from videos, and the board is found in all images. Cameras and rig are
@@ -134,7 +134,7 @@ def run_rectify(
     metres_per_unit: float = 1.0,
     out: Path | None = None,
     threads: int | None = None,
-) -> RectifyRun:
+) -> RectifyResult:
     """Rectify a pair, or all pairs of two folders: what `recon rectify` does.
 
     A calibration file says how, or else the features of some of the pairs. All images are warped;

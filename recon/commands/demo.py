@@ -7,7 +7,7 @@ from typing import Final
 
 from recon.commands.config import ReconConfig
 from recon.commands.kernels import compile_kernels
-from recon.commands.map import MapRun, run_map
+from recon.commands.map import MapResult, run_map
 from recon.commands.map_options import MapOptions
 from recon.map.fusion import fusion_range_m
 from recon.sources.synthetic import SyntheticSource
@@ -22,7 +22,7 @@ def run_demo(
     out: Path | None = None,
     mesh: bool = True,
     threads: int | None = None,
-) -> MapRun:
+) -> MapResult:
     """Render the street of the configuration and map it: what `recon demo` does."""
     compile_kernels("demo", config.matching.matcher)
     options = MapOptions("demo", out, threads, mesh=mesh, audit=False)

@@ -22,7 +22,7 @@ from recon.look.look import look_at
 from recon.map.drive.drive import Workspace
 from recon.map.drive.scale import measure_scene
 from recon.map.drive.sequence import map_sequence
-from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequence
+from recon.map.localize.sequence import LocalizeResult, StartPose, localize_sequence
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
@@ -40,7 +40,7 @@ def run_localize(
     options: MapOptions | None = None,
     *,
     start: StartPose | None = None,
-) -> LocalizeRun:
+) -> LocalizeResult:
     """Find the frames of a drive in a map, which is not changed: what `recon localize` does.
 
     Args:
@@ -75,7 +75,7 @@ def run_localize(
         drive = localize_sequence(source, workspace, config, **how)
         has_grid = folder is not None and (folder / GRID).is_file()
         grid = read_grid(map_path / GRID) if has_grid else None
-        made = LocalizeRun(source.name, str(map_path), drive, grid)
+        made = LocalizeResult(source.name, str(map_path), drive, grid)
         made.summary.update(source=source.name, **where, **drive.figures())
         seen = [
             *before.findings,

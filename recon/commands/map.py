@@ -40,7 +40,7 @@ from recon.look.look import Look, look_at
 from recon.look.rig import DEPTHS_M, KnownRig, RefinedRig, rig_shown
 from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import doubt_poses
-from recon.map.drive.scale import Scene, measure_scene
+from recon.map.drive.scale import SceneScale, measure_scene
 from recon.map.drive.sequence import MappedSequence, break_warnings, check_map, map_sequence
 from recon.map.map import Map
 from recon.map.store.finished import keep_map
@@ -60,7 +60,7 @@ _SAID: Final = frozenset({"rig", "nonrigid", "stabilised", "lag"})
 
 
 @dataclass(frozen=True, eq=False)
-class MapRun:
+class MapResult:
     """The results of a run."""
 
     mapped: MappedSequence  # the drive: its map, and what it cost
@@ -101,7 +101,7 @@ class MapRun:
 
 def run_map(
     source: StereoSource, config: ReconConfig | None = None, options: MapOptions | None = None
-) -> MapRun:
+) -> MapResult:
     """Map a drive: what `recon map` does.
 
     A quick audit says what is wrong with the recording. Frame by frame the drive becomes a map in
@@ -149,7 +149,7 @@ def run_map(
         first = [] if mapped.sfm is None else mapped.sfm.warnings()
         known = [*first, *breaks, *findings]
         warnings = [*seen.look.first, *known, *doubts, *made.warnings, *errors.warnings]
-        result = MapRun(mapped, made, errors, {})
+        result = MapResult(mapped, made, errors, {})
         result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
         result.summary["typical_depth_m"] = scene.depth_m
         with run.stage("write"):
@@ -183,7 +183,7 @@ def refuse_with_sfm(source: StereoSource, options: MapOptions) -> None:
 @contextmanager
 def _begun(
     source: StereoSource, config: ReconConfig, options: MapOptions
-) -> Iterator[tuple[Run, Map, Seen, Scene, ReconConfig]]:
+) -> Iterator[tuple[Run, Map, Seen, SceneScale, ReconConfig]]:
     """Begin a run and its map, once it is known what a look at the drive shows.
 
     The settings are those of the map, in which lengths that are not set follow from the scene.
@@ -327,7 +327,7 @@ def _warnings(
 
 def _summary(
     source: StereoSource,
-    result: MapRun,
+    result: MapResult,
     warnings: list[str],
     options: MapOptions,
     drift: ExpectedDrift | None,

@@ -31,7 +31,7 @@ from recon.io.files import StrPath, naming
 from recon.io.middlebury import stand_in_camera
 from recon.io.models.mesh import check_mesh_formats
 from recon.map.drive.sequence import check_cloud
-from recon.report.pair_page import PairRun, write_disparity_images, write_pair_page
+from recon.report.pair_page import PairResult, write_disparity_images, write_pair_page
 from recon.rig.audit import check_found, find_pair_faults
 from recon.run.run import Run
 from recon.sources.one_pair import PairInput
@@ -55,7 +55,7 @@ def run_pair(
     out: StrPath | None = None,
     formats: Sequence[str] = (),
     threads: int | None = None,
-) -> PairRun:
+) -> PairResult:
     """Reconstruct one pair: what `recon pair` does.
 
     The images are checked as `recon audit` checks a recording, rectified and matched. The points
@@ -110,7 +110,7 @@ def run_disparity(
     *,
     out: StrPath | None = None,
     threads: int | None = None,
-) -> PairRun:
+) -> PairResult:
     """Match one pair, and write disparity and reasons alone: what `recon disparity` does.
 
     The arguments and errors are those of `run_pair`.
@@ -140,7 +140,7 @@ def _compared(
     matched: tuple[Rectified, Disparity],
     figures: dict[str, Any],
     warnings: tuple[str, ...],
-) -> PairRun:
+) -> PairResult:
     """Return the results of a run, compared with the truth if it is known."""
     (pair, disparity), name = matched, given.pair.name
     warnings = (*warnings, *_idle_settings(config.matching))
@@ -155,7 +155,7 @@ def _compared(
         "warnings": list(warnings),
     }
     made: Any = {"truth": given.truth, "metrics": metrics, "by_kind": by_kind}
-    return PairRun(name, config, pair, disparity, summary, warnings=warnings, **made)
+    return PairResult(name, config, pair, disparity, summary, warnings=warnings, **made)
 
 
 def _reconstructor(given: PairInput, config: ReconConfig, run: Run) -> FrameReconstructor:

@@ -15,7 +15,7 @@ from recon.core.geometry.se3 import Motion, hat, make_transform
 from recon.core.values import ImuRecord
 from recon.core.values.arrays import Float64
 from recon.odometry.guide import Guided
-from recon.odometry.imu_runs import SeenRun
+from recon.odometry.imu_runs import ImuSpan
 
 _SIGMAS: Final = 4.7
 _MOST_STEPS: Final = 5.0  # usual steps between two samples; over a longer gap nothing is known
@@ -150,7 +150,7 @@ _PARTS: Final = 6  # parts of a drive that are looked at
 _MOST_UP_DEG: Final = 2.0  # standard deviation up to which up is known
 
 
-def find_up(gyro: Gyro, run: SeenRun, arm_m: Float64) -> tuple[Float64 | None, float]:
+def find_up(gyro: Gyro, run: ImuSpan, arm_m: Float64) -> tuple[Float64 | None, float]:
     """Return what is up (3,) in the axes of the first pose, and how well that is known, degrees.
 
     The forces that were measured, turned by the gyro and integrated twice, and gravity, take the

@@ -21,7 +21,7 @@ from recon.core.text import counted
 from recon.core.values import ImuRecord
 from recon.core.values.arrays import Float64
 from recon.odometry.imu import Gyro, ImuGuide, accelerations, doubt_forces, find_up, turns_after
-from recon.odometry.imu_runs import SeenRun
+from recon.odometry.imu_runs import ImuSpan
 from recon.odometry.prior import MAX_SIGMAS
 
 _LAGS_S: Final = np.linspace(-0.5, 0.5, 101)  # delays that are tried first
@@ -60,7 +60,7 @@ class FittedImu:
 def fit_imu(
     record: ImuRecord,
     stamps_s: Float64,
-    see: Callable[[], Sequence[SeenRun]],
+    see: Callable[[], Sequence[ImuSpan]],
     T_stated: Float64 | None,
 ) -> FittedImu:
     """Return the guide that an inertial unit is, corrected where the drive shows how.
@@ -196,7 +196,7 @@ def _faults(fit: _Fit, T_stated: Float64 | None) -> list[str]:
     return lines
 
 
-def _turns_of(runs: Sequence[SeenRun], record: ImuRecord) -> list[_Turn]:
+def _turns_of(runs: Sequence[ImuSpan], record: ImuRecord) -> list[_Turn]:
     """Return the turns of some runs, as far as the record covers them at any delay."""
     gyro, margin_s = Gyro(record, np.eye(3), np.zeros(3)), float(_LAGS_S[-1])
     turns = []

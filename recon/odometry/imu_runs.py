@@ -23,7 +23,7 @@ _FRAMES: Final = 12  # frames of each
 
 
 @dataclass(frozen=True, eq=False)
-class SeenRun:
+class ImuSpan:
     """Poses of consecutive frames whose motions are trusted, and how well these are known."""
 
     path: Trajectory
@@ -31,10 +31,10 @@ class SeenRun:
     sigma_rad: Float64  # (N - 1,)
 
 
-def seen_runs(source: StereoSource, reconstructor: FrameReconstructor) -> list[SeenRun]:
+def seen_runs(source: StereoSource, reconstructor: FrameReconstructor) -> list[ImuSpan]:
     """Return runs from all over a drive, in order."""
 
-    def seen(part: tuple[int, int]) -> list[SeenRun]:
+    def seen(part: tuple[int, int]) -> list[ImuSpan]:
         pairs = islice(source.frames(part[0]), part[1])
         return list(_runs(OdometryFrame(*reconstructor.match_roughly(pair)) for pair in pairs))
 
@@ -44,7 +44,7 @@ def seen_runs(source: StereoSource, reconstructor: FrameReconstructor) -> list[S
         return [run for runs in side_by_side(seen, parts, threads=FEW) for run in runs]
 
 
-def _runs(frames: Iterable[OdometryFrame]) -> Iterator[SeenRun]:
+def _runs(frames: Iterable[OdometryFrame]) -> Iterator[ImuSpan]:
     odometry, run = VisualOdometry(), list[tuple[float, OdometryResult]]()
     for frame in frames:
         found = odometry.register(frame)
@@ -56,11 +56,11 @@ def _runs(frames: Iterable[OdometryFrame]) -> Iterator[SeenRun]:
     yield from _run(run)
 
 
-def _run(found: list[tuple[float, OdometryResult]]) -> Iterator[SeenRun]:
+def _run(found: list[tuple[float, OdometryResult]]) -> Iterator[ImuSpan]:
     if len(found) < 2:
         return
     path = Trajectory(
         np.stack([result.T_world_camera for _, result in found]), np.array([t for t, _ in found])
     )
     sigmas = np.array([(r.health.sigma_m, np.deg2rad(r.health.sigma_deg)) for _, r in found[1:]])
-    yield SeenRun(path, *sigmas.T)
+    yield ImuSpan(path, *sigmas.T)

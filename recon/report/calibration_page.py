@@ -15,8 +15,8 @@ from recon.io.images.image import read_image
 from recon.report import style
 from recon.report.page import write_page
 from recon.rig.calibrate.bootstrap import CONFIDENCE, MATCH_SIGMA_PX
-from recon.rig.calibrate.result import CalibrationRun, shared_pixels
-from recon.rig.rectification import RectifyRun
+from recon.rig.calibrate.result import CalibrationResult, shared_pixels
+from recon.rig.rectification import RectifyResult
 from recon.run.directory import RunDirectory
 from recon.stereo.rectify.lens import epipolar_curves
 from recon.stereo.rectify.rectifier import Rectifier
@@ -25,7 +25,7 @@ Sides = Sequence[Any]  # one value for the left image, one for the right
 _CELLS: Final = (8, 6)
 
 
-def write_calibration_page(result: CalibrationRun, run: RunDirectory) -> None:
+def write_calibration_page(result: CalibrationResult, run: RunDirectory) -> None:
     """Write ``report.html`` of a calibration, and its images."""
     figures = {
         "coverage": coverage_figure(result),
@@ -38,7 +38,7 @@ def write_calibration_page(result: CalibrationRun, run: RunDirectory) -> None:
     write_page("calibration", run, result.summary, figures=figures)
 
 
-def _epipolar_pictures(result: CalibrationRun) -> dict[str, bytes]:
+def _epipolar_pictures(result: CalibrationResult) -> dict[str, bytes]:
     """Draw the view with median error."""
     fit, turns = result.fit, result.turns
     view = fit.views[int(np.argsort(fit.errors_px.sum(axis=1))[len(fit.views) // 2])]
@@ -54,7 +54,7 @@ def _epipolar_pictures(result: CalibrationRun) -> dict[str, bytes]:
 
 
 @style.styled
-def coverage_figure(result: CalibrationRun) -> bytes:
+def coverage_figure(result: CalibrationResult) -> bytes:
     """Draw all corners found in both images, over the cells of the coverage measure."""
     width, height = result.seen.size_px
     height_in = style.WIDE_IN / 2 * height / width + 0.5
@@ -74,7 +74,7 @@ def coverage_figure(result: CalibrationRun) -> bytes:
 
 
 @style.styled
-def errors_figure(result: CalibrationRun) -> bytes:
+def errors_figure(result: CalibrationResult) -> bytes:
     """Draw the RMS error of each view in both images, including dropped views."""
     fit = result.fit
     names = [style.label_of(name) for name in (*(view.name for view in fit.views), *fit.dropped)]
@@ -95,7 +95,7 @@ def errors_figure(result: CalibrationRun) -> bytes:
 
 
 @style.styled
-def epipolar_figure(result: CalibrationRun) -> bytes:
+def epipolar_figure(result: CalibrationResult) -> bytes:
     """Draw the row differences of the corners after rectification."""
     figure, axes = style.subplots(style.HALF_IN, 3.4)
     reach = max(float(np.quantile(np.abs(result.epipolar_error_px), 0.999)), 0.05)
@@ -106,7 +106,7 @@ def epipolar_figure(result: CalibrationRun) -> bytes:
 
 
 @style.styled
-def depth_error_figure(result: CalibrationRun) -> bytes:
+def depth_error_figure(result: CalibrationResult) -> bytes:
     """Draw the depth error by depth: from matching, and from calibration with its interval."""
     errors = result.spread.depths
     known = [each for each in errors if np.isfinite(each.calibration_m)]
@@ -129,7 +129,7 @@ def depth_error_figure(result: CalibrationRun) -> bytes:
     return style.to_png(figure)
 
 
-def write_epipolar_images(result: RectifyRun, run: RunDirectory) -> None:
+def write_epipolar_images(result: RectifyResult, run: RunDirectory) -> None:
     """Write ``pictures/epipolar_raw.png`` and ``pictures/epipolar_rectified.png``."""
     chosen = spread_points(result.raw_px[0], 12)
     lines = [[lines[n] for n in chosen] for lines in result.raw_lines]

@@ -19,7 +19,7 @@ from recon.io.atomic import write_bytes
 from recon.io.models.ply import write_ply
 from recon.look.rig import RefinedRig
 from recon.map.localize.localizer import State
-from recon.map.localize.sequence import LocalizedDrive, LocalizeRun
+from recon.map.localize.sequence import LocalizedDrive, LocalizeResult
 from recon.map.store.map_file import MapFile
 from recon.odometry.health import expected_drift
 from recon.report import drive_figures as figures
@@ -165,7 +165,7 @@ def widest_axes(positions_m: Float64) -> list[int]:
 _SHADES: Final = {State.SEARCHING: style.FAINT, State.COASTING: style.TRUTH, State.LOST: style.BAD}
 
 
-def write_localize_page(result: LocalizeRun, run: RunDirectory) -> None:
+def write_localize_page(result: LocalizeResult, run: RunDirectory) -> None:
     """Write ``report.html`` of a drive in a map."""
     path, T_map_world = result.drive.trajectory, result.drive.T_map_world
     drawn = {"certainty": certainty_figure(result.drive), "path": None}

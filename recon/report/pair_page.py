@@ -36,7 +36,7 @@ from recon.stereo.frame import StereoSettings
 
 
 @dataclass(frozen=True, eq=False)
-class PairRun:
+class PairResult:
     """Results of a run, from which its report is made."""
 
     name: str  # display name of the pair
@@ -59,13 +59,13 @@ class PairRun:
         return f"PairRun({self.name!r}, {made}, {counted(len(self.warnings), 'warning')})"
 
 
-def write_pair_page(result: PairRun, run: RunDirectory) -> None:
+def write_pair_page(result: PairResult, run: RunDirectory) -> None:
     """Write ``report.html`` of a pair, and its results as colour images."""
     write_disparity_images(result, run)
     write_page("pair", run, result.summary, **pair_content(result))
 
 
-def write_disparity_images(result: PairRun, run: RunDirectory) -> None:
+def write_disparity_images(result: PairResult, run: RunDirectory) -> None:
     """Write measured disparity, its confidence, and the reasons of a pair as colour images."""
     measured = result.disparity.only_measured()
     for name, image in (
@@ -76,7 +76,7 @@ def write_disparity_images(result: PairRun, run: RunDirectory) -> None:
         write_image(run.path(f"disparity/{name}_colour.png"), image)
 
 
-def pair_content(result: PairRun) -> Json:
+def pair_content(result: PairResult) -> Json:
     """Return what the page of a pair shows: disparity, accuracy and 3-D view."""
     values, truth, error = result.disparity.values, result.truth, None
     if truth is not None and truth.values.shape == values.shape:
@@ -96,7 +96,7 @@ def pair_content(result: PairRun) -> Json:
     }
 
 
-def _error_rows(result: PairRun) -> list[tuple[str, ...]]:
+def _error_rows(result: PairResult) -> list[tuple[str, ...]]:
     """Return the table of errors, its head first: of all pixels, and of each of two kinds alone."""
     if result.metrics is None:
         return []

@@ -48,7 +48,7 @@ class RectifyPlan:
 
 
 @dataclass(frozen=True, eq=False)
-class RectifyRun:
+class RectifyResult:
     """Results of a run; pixels are float64 (N, 2) of the left and the right image."""
 
     pair: StereoPair  # the first pair, as recorded
@@ -155,7 +155,7 @@ def read_pairs(images: ImagePairs) -> Iterator[tuple[StereoPair, tuple[Path, Pat
         yield pair, files
 
 
-def measure_epipolar(plan: RectifyPlan, pair: StereoPair) -> RectifyRun:
+def measure_epipolar(plan: RectifyPlan, pair: StereoPair) -> RectifyResult:
     """Rectify a pair, and measure the epipolar errors that are left by its feature matches."""
     found = match_exactly(to_grey(pair.left), to_grey(pair.right))
     raw = (found.left_uv.astype(np.float64), found.right_uv.astype(np.float64))
@@ -171,6 +171,6 @@ def measure_epipolar(plan: RectifyPlan, pair: StereoPair) -> RectifyRun:
             "epipolar_error_95_px": float(np.quantile(rows[good], 0.95)),
         }
     kept = (raw[0][good], raw[1][good])
-    return RectifyRun(
+    return RectifyResult(
         pair, plan.warp(pair), kept, plan.lines(*kept), (left[good], right[good]), summary
     )

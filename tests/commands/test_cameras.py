@@ -26,7 +26,7 @@ from recon.io.images.image import read_image, write_image
 from recon.io.trajectory import FRAMES, HEADER
 from recon.rig import capture
 from recon.rig.calibrate.board_views import find_views
-from recon.rig.calibrate.result import CalibrationRun, write_calibration
+from recon.rig.calibrate.result import CalibrationResult, write_calibration
 from recon.sources.image_names import pair_images
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
@@ -57,7 +57,7 @@ def drawn(tmp_path_factory):
     return folder
 
 
-def calibrate(folder: Path, out: Path, board: str = "chess:9x6:25mm") -> CalibrationRun:
+def calibrate(folder: Path, out: Path, board: str = "chess:9x6:25mm") -> CalibrationResult:
     sides = (str(folder / "left*.png"), str(folder / "right*.png"))
     files = {"file": out / "rig.yaml", "out": out / "report"}
     return run_calibrate(*sides, parse_board(board), load_config(), threads=1, **files)

@@ -9,7 +9,7 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.commands.localize import run_live
-from recon.commands.map import MapRun, run_map
+from recon.commands.map import MapResult, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.progress import showing
 from recon.io.trajectory import read_tum
@@ -30,20 +30,20 @@ def broken(street_film: Film) -> Film:
     return Film(pairs, street_film.calibration, poses)
 
 
-def _map(drive: Film, out: Path, *, resume: bool = False, breaks: int = -1) -> MapRun:
+def _map(drive: Film, out: Path, *, resume: bool = False, breaks: int = -1) -> MapResult:
     options = MapOptions(audit=False, out=out, mesh=False, resume=resume)
     with showing(Breaks(breaks)):
         return run_map(drive, load_config(None, ["checkpoints.every_frames=5"]), options)
 
 
 @pytest.fixture(scope="module")
-def whole(broken: Film, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapRun]:
+def whole(broken: Film, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, MapResult]:
     folder = tmp_path_factory.mktemp("whole")
     return folder, _map(broken, folder)
 
 
 def test_a_place_seen_again_joins_what_a_break_has_parted(
-    street_film: Film, whole: tuple[Path, MapRun]
+    street_film: Film, whole: tuple[Path, MapResult]
 ):
     folder, run = whole
     summary, count = summary_of(folder), len(street_film)
@@ -76,7 +76,7 @@ def test_live_the_sessions_are_the_same_and_said_first(
 
 @pytest.mark.slow
 def test_a_run_that_was_killed_after_the_breaks_gives_the_same_sessions(
-    broken: Film, whole: tuple[Path, MapRun], tmp_path: Path
+    broken: Film, whole: tuple[Path, MapResult], tmp_path: Path
 ):
     with pytest.raises(KeyboardInterrupt, match="--resume"):
         _map(broken, tmp_path, breaks=len(broken) - 4)

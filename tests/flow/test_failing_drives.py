@@ -18,7 +18,7 @@ from recon.commands.config import load_config
 from recon.commands.evaluate import run_evaluate_map, run_evaluate_trajectory
 from recon.commands.export import run_export, run_mesh, run_occupancy
 from recon.commands.localize import run_localize
-from recon.commands.map import MapRun, run_map
+from recon.commands.map import MapResult, run_map
 from recon.commands.map_options import MapOptions
 from recon.commands.merge import run_merge, run_remove
 from recon.core.errors import CalibrationError, MappingError, RegistrationError
@@ -131,11 +131,11 @@ def map_drive(pairs, folder, *settings, baseline=1, **more):
     return run_map(source if baseline == 1 else wrong, load_config(None, settings), options)
 
 
-def doubted(run: MapRun) -> list[int]:
+def doubted(run: MapResult) -> list[int]:
     return [index for index, record in enumerate(run.mapped.health) if not record.ok]
 
 
-def off_m(run: MapRun, road: Road, index: int) -> float:
+def off_m(run: MapResult, road: Road, index: int) -> float:
     """Distance of the end of the path to where frame ``index`` was taken."""
     truth = road.pose(index)[:3, 3]
     return float(np.linalg.norm(run.mapped.trajectory.positions_m[-1] - truth))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.commands.map import MapRun, run_map
+from recon.commands.map import MapResult, run_map
 from recon.commands.map_options import MapOptions
 from recon.core.progress import showing
 from recon.core.values import SequenceTruth
@@ -21,7 +21,7 @@ from tests.scenery.film import Film, film
 
 pytestmark = pytest.mark.slow
 
-Closed = tuple[Path, MapRun]
+Closed = tuple[Path, MapResult]
 SIDE_M, STEP_M = 60.0, 1.5
 LAP_M = 4 * SIDE_M - 8 * CORNER_M + 2 * math.pi * CORNER_M
 
@@ -34,7 +34,9 @@ def _film(**street: object) -> Film:
     return made
 
 
-def _run(drive: Film, out: Path, *settings: str, resume: bool = False, breaks: int = -1) -> MapRun:
+def _run(
+    drive: Film, out: Path, *settings: str, resume: bool = False, breaks: int = -1
+) -> MapResult:
     options = MapOptions(audit=False, out=out, mesh=False, resume=resume)
     with showing(Breaks(breaks)):
         return run_map(drive, load_config(None, settings), options)

@@ -12,7 +12,7 @@ from recon.odometry.checked import CheckedOdometry
 from recon.odometry.guide import Guided
 from recon.odometry.imu import Gyro, ImuGuide
 from recon.odometry.imu_fit import fit_imu
-from recon.odometry.imu_runs import SeenRun
+from recon.odometry.imu_runs import ImuSpan
 from recon.odometry.visual import VisualOdometry
 from tests.odometry.conftest import CAMERA
 
@@ -42,14 +42,14 @@ def measured(rate_hz: float = 200.0) -> ImuRecord:
     return ImuRecord(times_s, np.array(gyro), np.array(accel), T_CAMERA_IMU, "imu")
 
 
-def seen() -> list[SeenRun]:
+def seen() -> list[ImuSpan]:
     """What cameras see of it: turns to 0.03 degrees."""
     rng, poses = np.random.default_rng(1), np.stack([pose(t) for t in FRAMES_S])
     for T in poses[1:]:
         T[:3, :3] = T[:3, :3] @ exp_so3(rng.normal(scale=5e-4, size=3))
     motions = len(poses) - 1
     path = Trajectory(poses, FRAMES_S)
-    return [SeenRun(path, np.full(motions, 2e-3), np.full(motions, 7e-4))]
+    return [ImuSpan(path, np.full(motions, 2e-3), np.full(motions, 7e-4))]
 
 
 @pytest.fixture(scope="module")

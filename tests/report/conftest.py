@@ -152,7 +152,7 @@ def drive(request):
 
 @pytest.fixture
 def view(pair, disparity, cloud):
-    """A `PairRun`."""
+    """A `PairResult`."""
     return SimpleNamespace(
         name="scenes/bike/im0.png",
         pair=pair,

@@ -24,20 +24,20 @@ _SERIES: Final = [float(f"{n}e{k}") for k in range(-6, 4) for n in (1, 2, 5)]
 
 
 @dataclass(frozen=True)
-class Scene:
+class SceneScale:
     """What frames of a drive show of its size."""
 
     scale: float = 1.0  # against a road
     depth_m: float | None = None  # typical depth; None = nothing was matched, or looked at
 
 
-def measure_scene(pairs: Iterable[Recorded], rig: Rig, settings: StereoSettings) -> Scene:
+def measure_scene(pairs: Iterable[Recorded], rig: Rig, settings: StereoSettings) -> SceneScale:
     """Measure how large what a drive shows is, on a few of its pairs."""
     depths = list(_depths(pairs, rig, settings))
     if not depths:
-        return Scene()
+        return SceneScale()
     depth_m, sigma_m = np.median(depths, axis=0).tolist()
-    return Scene(scale_of(depth_m, sigma_m), depth_m)
+    return SceneScale(scale_of(depth_m, sigma_m), depth_m)
 
 
 def scale_of(depth_m: float, sigma_m: float) -> float:

@@ -214,7 +214,7 @@ def localize_sequence(
 
 
 @dataclass(frozen=True, eq=False)
-class LocalizeRun:
+class LocalizeResult:
     """Results of a run; the grid is None where that of the map has none."""
 
     name: str

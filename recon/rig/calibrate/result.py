@@ -31,7 +31,7 @@ _KEPT: Final = (
 
 
 @dataclass(frozen=True, eq=False)
-class CalibrationRun:
+class CalibrationResult:
     """The results of a run."""
 
     config: CalibratedSettings
@@ -45,7 +45,7 @@ class CalibrationRun:
 
 def describe_calibration(
     seen: BoardViews, fit: StereoFit, spread: Spread, config: CalibratedSettings
-) -> CalibrationRun:
+) -> CalibrationResult:
     """Rectify the views with the calibrated rig, and measure how well it describes them."""
     turns = plan_turns(fit.calibration, config.rectification)
     rows = []
@@ -55,11 +55,11 @@ def describe_calibration(
     epipolar_error_px = np.concatenate(rows)
     summary = _summarise(seen, fit, spread, epipolar_error_px)
     summary["rectified_focal_px"] = turns.camera.focal_px
-    return CalibrationRun(config, seen, fit, spread, turns, epipolar_error_px, summary)
+    return CalibrationResult(config, seen, fit, spread, turns, epipolar_error_px, summary)
 
 
 def write_calibration(
-    path: Path, run: CalibrationRun, form: CalibrationForm | None = None
+    path: Path, run: CalibrationResult, form: CalibrationForm | None = None
 ) -> tuple[Path, ...]:
     """Write the calibrated rig; see `write_rig`."""
     quality = {key: run.summary[key] for key in _KEPT}
