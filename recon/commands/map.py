@@ -341,7 +341,7 @@ def _summary(
         "frames": frames,
         "fps": frames / mapped.seconds if mapped.seconds > 0 else None,
         "frames_joined": int(mapped.joined.sum()),
-        "segments": [to_json(session) for session in mapped.sessions],
+        "segments": [to_json(segment) for segment in mapped.segments],
         "path_length_m": mapped.trajectory.select(mapped.joined).path_length_m,
         "expected_drift_percent": None if drift is None else drift.percent,
         "expected_drift_rig_percent": None if drift is None else drift.rig_percent,

@@ -22,7 +22,7 @@ from recon.export.mesh.texture import texture_product
 from recon.export.nerfstudio import nerfstudio_product
 from recon.export.occupancy import grid_product, octomap_product
 from recon.export.product import ExportContext, ExportResult, Product
-from recon.export.rasters import RASTERS, raster_product
+from recon.export.rasters import RASTERS, raster_product, stem_of
 from recon.export.survey import copc_product, e57_product, las_product
 from recon.io.atomic import check_targets, writing_to
 from recon.io.models.mesh import MESH_SUFFIXES
@@ -41,7 +41,9 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "texture": Product("texture/mesh.glb", texture_product, needs_images=True, surveyed=True),
     # Their cells, and the ground far from the path, are those of the voxels.
     **{
-        name: Product(f"map/{name}.tif", raster_product(name), needs_occupancy=True, surveyed=True)
+        name: Product(
+            f"map/{stem_of(name)}.tif", raster_product(name), needs_occupancy=True, surveyed=True
+        )
         for name in RASTERS
     },
     "las": Product("map/cloud.las", las_product, surveyed=True),
@@ -55,6 +57,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "colmap": Product("colmap", colmap_product, needs_images=True),
     "nerfstudio": Product("nerfstudio", nerfstudio_product, needs_images=True),
 }
+FORMER_PRODUCTS: Final = {"occupancy": "grid-geotiff"}  # before 1.0
 USUAL: Final = ("cloud", "octomap", "grid", "mesh")  # unless something else is asked for
 OF_A_PAIR: Final = ("cloud", "mesh")
 
@@ -163,6 +166,7 @@ def write_product(context: ExportContext, name: str, path: Path) -> ExportResult
 def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:
     """Return the requested products, or the usual ones."""
     possible = OF_A_PAIR if pair else (*PRODUCTS,)
+    products = [FORMER_PRODUCTS.get(product, product) for product in products]
     for product in products:
         if product not in possible:
             what, hint = "unknown product", None

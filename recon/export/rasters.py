@@ -26,6 +26,11 @@ _CORNERS: Final = np.array([*product((0.0, 1.0), repeat=2)])
 Fill = Callable[[ExportContext, RasterFile, Float64], None]
 
 
+def stem_of(name: str) -> str:
+    """Return the name of the file of one of `RASTERS`."""
+    return name.removesuffix("-geotiff")
+
+
 def raster_product(name: str) -> Callable[[ExportContext, Path], ExportResult]:
     """Return what writes one of `RASTERS`, perhaps in survey coordinates."""
     fill, colours = RASTERS[name]
@@ -35,7 +40,7 @@ def raster_product(name: str) -> Callable[[ExportContext, Path], ExportResult]:
         place = _place(context, T_file_map)
         with write_geotiff(path, place, colours=colours, crs=context.crs) as file:
             fill(context, file, T_file_map)
-        return ExportResult({f"{name}_size": [place.columns, place.rows]})
+        return ExportResult({f"{stem_of(name)}_size": [place.columns, place.rows]})
 
     return write
 
@@ -123,7 +128,7 @@ def ground_slopes(ground: GroundSurface, xy_m: Float64) -> Float64:
     return np.asarray(np.arctan(np.hypot(*rises) / (2 * ground.cell_m)))
 
 
-def _occupancy(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
+def _flat_grid(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
     """Write what the flat grid has at the middle of each cell: 0 = free, 100 = occupied."""
     grid, T_map_file, place = make_grid(context.placed)[0], invert(T_file_map), file.place
     for row in range(0, place.rows, _ROWS):
@@ -168,6 +173,6 @@ RASTERS: Final[dict[str, tuple[Fill, bool]]] = {
     "dtm": (_ground_heights, False),
     "slope": (_ground_slopes, False),
     "orthophoto": (_surface_colours, True),
-    "occupancy": (_occupancy, False),
+    "grid-geotiff": (_flat_grid, False),
 }
 """What fills a raster, and whether it is one of colours."""

@@ -43,12 +43,12 @@ def export_paths(
     """Write ``trajectory_*.txt`` of a drive, and ``loops.json`` if loops were closed.
 
     They have the frames that are joined (N,). Each other part of the drive between two breaks has
-    ``sessions/<number>/trajectory_tum.txt``, in axes of its own.
+    ``segments/<number>/trajectory_tum.txt``, in axes of its own.
     """
     segment = segment_numbers(session.health)
     for number in np.unique(segment[~joined & (segment >= 0)]).tolist():
         apart = session.trajectory.select(segment == number)
-        write_tum(folder / f"sessions/{number}/trajectory_tum.txt", apart)
+        write_tum(folder / f"segments/{number}/trajectory_tum.txt", apart)
     path = session.trajectory.select(joined)
     write_kitti_poses(folder / "trajectory_kitti.txt", path)
     write_tum(folder / "trajectory_tum.txt", path)

@@ -55,27 +55,27 @@ def test_a_place_seen_again_joins_what_a_break_has_parted(
     truth = np.tile(street_film.trajectory.positions_m, (2, 1))
     assert np.linalg.norm(path.positions_m - truth, axis=1).max() < 0.1
     first = run.warnings[0]
-    assert first.startswith("THE PATH BREAKS INTO 3 SESSIONS")
+    assert first.startswith("TRAJECTORY HAS 3 SEGMENTS")
     assert f"frames {count}-{count + 4}" in first
     assert first in (folder / "report.html").read_text()
-    apart = sorted(path.relative_to(folder) for path in (folder / "sessions").rglob("*.txt"))
-    assert apart == [Path("sessions/1/trajectory_tum.txt")]
+    apart = sorted(path.relative_to(folder) for path in (folder / "segments").rglob("*.txt"))
+    assert apart == [Path("segments/1/trajectory_tum.txt")]
     assert len(read_tum(folder / apart[0])) == 5
 
 
-def test_live_the_sessions_are_the_same_and_said_first(
+def test_live_the_segments_are_the_same_and_said_first(
     street_film: Film, broken: Film, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     be_patient(monkeypatch)
     options = MapOptions("live", tmp_path, mesh=False)
     summary, count = run_live(broken, load_config(), options, rate=10.0), len(street_film)
-    sessions = [(one["first"], one["joined"]) for one in summary["segments"]]
-    assert sessions == [(0, True), (count, False), (count + 5, True)]
-    assert summary["warnings"][0].startswith("THE PATH BREAKS INTO 3 SESSIONS")
+    segments = [(one["first"], one["joined"]) for one in summary["segments"]]
+    assert segments == [(0, True), (count, False), (count + 5, True)]
+    assert summary["warnings"][0].startswith("TRAJECTORY HAS 3 SEGMENTS")
 
 
 @pytest.mark.slow
-def test_a_run_that_was_killed_after_the_breaks_gives_the_same_sessions(
+def test_a_run_that_was_killed_after_the_breaks_gives_the_same_segments(
     broken: Film, whole: tuple[Path, MapResult], tmp_path: Path
 ):
     with pytest.raises(KeyboardInterrupt, match="--resume"):

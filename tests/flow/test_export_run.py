@@ -178,7 +178,7 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
             row, column = rasterio.transform.rowcol(file.transform, *places[:, :2].T)
             return file.read(band)[row, column]
 
-    for name in ("dsm", "dtm", "slope", "occupancy"):
+    for name in ("dsm", "dtm", "slope", "grid"):
         with rasterio.open(out / f"map/{name}.tif") as file:
             assert np.isnan(file.nodata)
             assert not np.isinf(file.read(1)).any()
@@ -196,13 +196,13 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     driven = there[-2:, 1:] + 8.0 * ahead / np.linalg.norm(ahead)
     assert np.abs(at_points("dtm", places=driven) - driven[:, 2]).max() < 0.1
     assert np.nanmedian(at_points("slope")) < 3
-    assert (at_points("occupancy", places=driven) == 0).all()
+    assert (at_points("grid", places=driven) == 0).all()
     grid = read_grid(small_demo / "map/grid.yaml")
     i, j = np.argwhere(grid.cells == OCCUPIED).T
     xy_m = grid.origin_m + grid.resolution_m * (np.column_stack([j, i]) + 0.5)
     placed = np.column_stack([xy_m, np.zeros(len(i))]) @ R.T + origin
     inside = (placed[:, :2] > xyz[:, :2].min(0)) & (placed[:, :2] < xyz[:, :2].max(0))
-    found = at_points("occupancy", places=placed[inside.all(axis=1)])
+    found = at_points("grid", places=placed[inside.all(axis=1)])
     # A turned cell has the middle of another one: some at the edge of what stands are free.
     assert found.size > 100
     assert np.mean(found == OCCUPIED) > 0.7

@@ -248,7 +248,7 @@ def test_where_nothing_says_how_a_drive_went_on_another_submap_begins(seen, tmp_
     assert run.mapped.health[2].skipped
     assert [n for n, record in enumerate(run.mapped.health) if record.begins] == [6]
     assert [entry.first_frame for entry in run.mapped.session.submaps.entries] == [0, 6]
-    assert [(one.first, one.joined) for one in run.mapped.sessions] == [(0, True), (6, False)]
+    assert [(one.first, one.joined) for one in run.mapped.segments] == [(0, True), (6, False)]
 
 
 @pytest.fixture(scope="module")

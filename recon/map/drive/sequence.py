@@ -130,7 +130,7 @@ class MappedSequence:
         return self.map.joined(self.session)
 
     @cached_property
-    def sessions(self) -> list[DriveSegment]:
+    def segments(self) -> list[DriveSegment]:
         """The parts of the drive between its breaks, in order."""
         segment = segment_numbers(self.health)
         parts = [np.flatnonzero(segment == n) for n in range(int(segment.max(initial=-1)) + 1)]
@@ -168,21 +168,17 @@ class MappedSequence:
 
 def break_warnings(mapped: MappedSequence) -> list[str]:
     """Return what to know first of all about a drive whose odometry was lost."""
-    sessions = mapped.sessions
-    if len(sessions) < 2:
+    segments = mapped.segments
+    if len(segments) < 2:
         return []
-    into = f"the path breaks into {counted(len(sessions), 'session')}"
-    apart = [session for session in sessions if not session.joined]
+    apart = [segment for segment in segments if not segment.joined]
     if not apart:
-        return [f"{into}, which places that were seen again join"]
-    lost, frames = sum(one.frames for one in apart), sum(one.frames for one in sessions)
+        return [f"the trajectory has {len(segments)} segments, which loop closures connect"]
+    lost, frames = sum(one.frames for one in apart), sum(one.frames for one in segments)
     named = name_frames([n for one in apart for n in range(one.first, one.last + 1)])
-    lie = "one of them lies" if len(apart) == 1 else f"{len(apart)} of them lie"
-    why = f"nothing that was seen again says where {lie} ({named})"
     way_on = "" if mapped.sfm else "; recon map --odometry sfm takes frames in any order"
-    return [
-        f"{into.upper()}: {why}; {lost} of {counted(frames, 'frame')} are not in the map{way_on}"
-    ]
+    missing = f"{lost} of {counted(frames, 'frame')} are not in the map{way_on}"
+    return [f"TRAJECTORY HAS {len(segments)} SEGMENTS: no loop closure connects {named}; {missing}"]
 
 
 def map_sequence(

@@ -79,7 +79,7 @@ def test_frames_that_show_nothing_before_the_first_change_no_axes(street):
     late = Film([*dark.pairs, *street.pairs], street.calibration, np.tile(np.eye(4), (10, 1, 1)))
     seen, waited = (map_sequence(source, DriveSettings()) for source in (street, late))
     np.testing.assert_array_equal(waited.T_map_world, seen.T_map_world)
-    assert [(one.first, one.last) for one in waited.sessions] == [(2, 9)]
+    assert [(one.first, one.last) for one in waited.segments] == [(2, 9)]
     assert len(waited.cloud) == len(seen.cloud)
 
 
