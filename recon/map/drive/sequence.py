@@ -173,12 +173,15 @@ def break_warnings(mapped: MappedSequence) -> list[str]:
         return []
     apart = [segment for segment in segments if not segment.joined]
     if not apart:
-        return [f"the trajectory has {len(segments)} segments, which loop closures connect"]
+        return [
+            f"the trajectory has {counted(len(segments), 'segment')}, which loop closures connect"
+        ]
     lost, frames = sum(one.frames for one in apart), sum(one.frames for one in segments)
     named = name_frames([n for one in apart for n in range(one.first, one.last + 1)])
     way_on = "" if mapped.sfm else "; recon map --odometry sfm takes frames in any order"
     missing = f"{lost} of {counted(frames, 'frame')} are not in the map{way_on}"
-    return [f"TRAJECTORY HAS {len(segments)} SEGMENTS: no loop closure connects {named}; {missing}"]
+    into = counted(len(segments), "segment")
+    return [f"TRAJECTORY HAS {into.upper()}: no loop closure connects {named}; {missing}"]
 
 
 def map_sequence(
