@@ -87,7 +87,7 @@ def measured(scene: StreetScene) -> dict[str, Any]:
         "path_m": round(truth.path_length_m, 2),
         "frames": len(truth),
         "frames_placed": int(placed.sum()),
-        "sessions": len(mapped.sessions),
+        "sessions": len(mapped.segments),
         "ate_percent": 100.0 * float(np.sqrt(np.mean(off_m**2))) / truth.path_length_m,
         "largest_error_m": float(off_m.max()),
         "loops": len(closed),
