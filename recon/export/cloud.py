@@ -1,9 +1,10 @@
-"""The fused cloud of a map as files, and an even sample of it for images and reports."""
+"""The fused cloud of a map as files, also for surveying; an even sample for images and reports."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,10 +13,17 @@ from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
+from recon.core.values.arrays import Bool
+from recon.export.occupancy import GROUND_SHARE, grounds
 from recon.export.product import Made, Order
+from recon.io.models.copc import write_copc
+from recon.io.models.e57 import write_e57
+from recon.io.models.las import AreGround, write_las
 from recon.io.models.npz import write_npz
 from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import write_ply_tiles
+from recon.map.ground.surface import MAX_TILT_DEG, WINDOW_M, GroundSurface
+from recon.map.sessions.placed import PlacedMap
 from recon.map.tiles import Tiles
 
 SAMPLE_POINTS: Final = 300_000  # points of the fused cloud that are kept for display
@@ -129,3 +137,51 @@ class CloudSample:
             return cloud
         keys = voxels.pack_keys(np.floor(cloud.xyz / self._cell_m).astype(np.int64))
         return cloud.select(np.sort(np.unique(keys, return_index=True)[1]))
+
+
+def las_product(order: Order, path: Path, write: Callable[..., int] = write_las) -> Made:
+    """Write the cloud as LAS or LAZ, with the ground as a class, perhaps where a survey says."""
+    clouds = (tile.cloud for tile in order.placed.tiles)
+    # A hundredth of a voxel, as a decimal: a millimetre on a road.
+    step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
+    how = {"step_m": step_m, "ground": _ground_of(order.placed)}
+    return Made({"points": write(path, clouds, order.T_survey_map, order.crs, **how)})
+
+
+def copc_product(order: Order, path: Path) -> Made:
+    """Write the cloud as COPC, as `las_product` does."""
+    return las_product(order, path, write_copc)
+
+
+def e57_product(order: Order, path: Path) -> Made:
+    """Write the cloud as E57, perhaps where a survey says."""
+    clouds = (tile.cloud for tile in order.placed.tiles)
+    return Made({"points": write_e57(path, clouds, order.T_survey_map, order.crs)})
+
+
+def _ground_of(placed: PlacedMap) -> AreGround:
+    """Return what tells which points of a tile are ground; far from the path, none is known."""
+    tiles, known = placed.tiles, dict(grounds(placed))
+
+    def are_ground(cloud: PointCloud) -> Bool:
+        if not len(cloud):
+            return np.zeros(0, np.bool_)
+        column, row = (cloud.xyz[0, :2] // tiles.edge_m).astype(int).tolist()
+        surface = known.get(tiles.bounds((column, row)))
+        return np.zeros(len(cloud), np.bool_) if surface is None else ground_points(cloud, surface)
+
+    return are_ground
+
+
+def ground_points(cloud: PointCloud, surface: GroundSurface) -> Bool:
+    """Return bool (N,), which points lie on a surface and, if normals are known, face up.
+
+    Nothing but ground lies below it: as far as that is seen too low, it is seen too high elsewhere.
+    """
+    above_m = cloud.xyz[:, 2] - surface.height_at(cloud.xyz[:, :2])
+    below_m = -above_m[(above_m <= 0) & (above_m >= -WINDOW_M)]
+    thick_m = float(np.quantile(below_m, GROUND_SHARE)) if len(below_m) else 0.0
+    on = np.abs(above_m) <= thick_m  # not where the surface is unknown
+    if cloud.normals is not None:
+        on &= cloud.normals[:, 2] >= math.cos(math.radians(MAX_TILT_DEG))
+    return np.asarray(on)

@@ -10,8 +10,7 @@ import numpy as np
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.camera import project
-from recon.export.images import DriveImages
-from recon.export.product import Made, Order
+from recon.export.product import DriveImages, Made, Order
 from recon.io.images.image import write_image
 from recon.io.models.colmap import ColmapModel, Seen, write_colmap
 from recon.map.store.trees import loop_in

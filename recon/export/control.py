@@ -17,7 +17,7 @@ from recon.core.text import metres
 from recon.core.values import Disparity, RectifiedCamera, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import project, unproject
-from recon.export.images import DriveImages, open_images
+from recon.export.product import DriveImages, open_images
 from recon.io.control_points import ControlPoints
 from recon.io.models.las import check_inside
 from recon.map.map import Map

@@ -13,9 +13,8 @@ from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64, UInt8
 from recon.export.cloud import even_sample
-from recon.export.images import DriveImages
 from recon.export.occupancy import make_grid
-from recon.export.product import Made, Order
+from recon.export.product import DriveImages, Made, Order
 from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
 from recon.io.models.ros_bag import Message, RosBag, header, points, pose, write_bag

@@ -20,8 +20,7 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Int64
 from recon.core.values.camera import project
 from recon.export.cloud import even_sample
-from recon.export.images import DriveImages
-from recon.export.product import Made, Order
+from recon.export.product import DriveImages, Made, Order
 from recon.io.fields import write_json
 from recon.io.images.image import write_image
 from recon.io.models.colmap import PIXEL_CENTRE

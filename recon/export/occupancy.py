@@ -23,8 +23,15 @@ from recon.io.models.octomap import write_octomap_tiles
 from recon.map.builders import MIN_PROBABILITY
 from recon.map.cut import Rectangle, TileKey
 from recon.map.ground.axes import base_axes
-from recon.map.ground.driven import DrivenPath, is_driven, sweep
-from recon.map.ground.grid import GridSettings, drop_undecided, flatten, ground_depths
+from recon.map.ground.grid import (
+    DrivenPath,
+    GridSettings,
+    drop_undecided,
+    flatten,
+    ground_depths,
+    is_driven,
+    sweep,
+)
 from recon.map.ground.surface import (
     GroundSettings,
     GroundSurface,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,12 +11,12 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import FormatError, MeshingError
+from recon.core.open3d_raycasting import RayScene
 from recon.core.values import Disparity, PointCloud, RectifiedCamera, Texture, TriangleMesh
 from recon.core.values.arrays import UInt8
 from recon.core.values.camera import depth_from_disparity, project
 from recon.core.values.cloud import Frame
 from recon.core.values.image import in_colour
-from recon.export.mesh.coverage import check_coverage, mesh_coverage
 from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.pieces import WHOLE
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
@@ -162,3 +163,28 @@ def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:
         got = f"{image.shape[1]}x{image.shape[0]}"
         raise FormatError(what, where=path, got=got, expected=expected)
     return in_colour(image)
+
+
+# A point is covered if the mesh is no farther from it than this share of its depth.
+COVERED_WITHIN: Final = 0.005
+LEAST_COVERAGE: Final = 0.8  # share of the points of a pair that its mesh should cover
+_COVERAGE_SAMPLES: Final = 100_000
+
+
+def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
+    """Return the share of the points of a pair that are covered by its mesh, from 0 to 1.
+
+    Of more than 100,000 points, every n-th is used.
+    """
+    xyz = cloud.xyz[:: math.ceil(len(cloud) / _COVERAGE_SAMPLES)]
+    distance_m = RayScene(mesh.vertices[mesh.faces]).distance(xyz)
+    return float(np.mean(distance_m <= COVERED_WITHIN * xyz[:, 2]))
+
+
+def check_coverage(coverage: float) -> tuple[str, ...]:
+    """Return a warning if the mesh of a pair leaves out much of its cloud."""
+    if coverage >= LEAST_COVERAGE:
+        return ()
+    tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
+    advice = "lower mesh.min_component_faces, or use the cloud"
+    return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)

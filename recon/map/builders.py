@@ -1,4 +1,7 @@
-"""What frames add to a submap: sums per voxel of the cloud, and log-odds of cells by ray casting.
+"""Submaps, and what frames add to them: sums per voxel of the cloud, log-odds of cells by rays.
+
+A submap is consecutive frames, built in the world of the odometry. Where loop closure moves it, its
+voxels are moved with it, and nothing is matched again.
 
 Occupancy is built from the rays that are kept of each frame, points averaged in small cubes and
 rounded, so that the same map can be built again, and others with other voxels, heights or poses.
@@ -6,12 +9,14 @@ rounded, so that the same map can be built again, and others with other voxels, 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
+from recon.core.geometry.se3 import invert
 from recon.core.kernels import voxels
 from recon.core.settings import Length, Settings
 from recon.core.values import Frame, OccupancyVoxels, PointCloud, RayCloud, RayGrain
@@ -315,3 +320,50 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
 def _beyond_m(settings: OccupancySettings) -> float:
     """Return where points out of range are moved to: never into a cube with one in range."""
     return settings.max_range_m + 2 * settings.resolution_m / RAYS_PER_VOXEL
+
+
+class SubmapSettings(Settings):
+    """Where a drive is divided into submaps, and into which tiles its map.
+
+    Both bound the memory. Apart from rounding they change no result, except where a vehicle turned
+    back and saw something on its own track: whether that came later is known by submaps.
+    """
+
+    length_m: float = Length(25.0, ge=1e-06, le=100_000.0)
+    """Path after which a new submap begins. Shorter ones bend better with closed loops and take
+    less memory."""
+    tile_m: float = Length(50.0, ge=1e-06, le=100_000.0)
+    """Edge of the tiles, rounded to whole voxels. Smaller ones take less memory, and more time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """What consecutive frames saw: ``fused`` in world axes, ``occupancy`` in map axes."""
+
+    index: int
+    first_frame: int
+    frames: int
+    fused: FusedPart
+    occupancy: OccupancyPart
+
+    def moved(
+        self, T_corrected_world: Float64, T_map_world: Float64, voxel_m: float, resolution_m: float
+    ) -> Submap:
+        """Return the submap after a correction of its pose."""
+        T_corrected_map = T_map_world @ T_corrected_world @ invert(T_map_world)
+        return replace(
+            self,
+            fused=self.fused.moved(T_corrected_world, voxel_m),
+            occupancy=self.occupancy.moved(T_corrected_map, resolution_m),
+        )
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Submap:
+        """Return the submap that a tree (`tree_of`) is of."""
+        return cls(
+            tree["index"],
+            tree["first_frame"],
+            tree["frames"],
+            FusedPart.from_tree(tree["fused"]),
+            OccupancyPart.from_tree(tree["occupancy"]),
+        )

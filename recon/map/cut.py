@@ -19,6 +19,7 @@ from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float64, Int64, tree_of
+from recon.map.builders import Submap
 from recon.map.fusion import ALL, FusedPart, row_bytes
 from recon.map.ground.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
@@ -26,7 +27,6 @@ from recon.map.occupancy.moving import GROWTH_CELLS
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.records import Store
-from recon.map.submaps import Submap
 
 FUSED: Final = "fused"  # kind of the parts of the fused cloud in the tiles
 OCCUPANCY: Final = "occupancy"  # kind of the parts of the occupancy

@@ -24,6 +24,7 @@ from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.core.values.grid import log_odds
+from recon.map.builders import Submap
 from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter, Rectangle, TileKey, TileParts
 from recon.map.fusion import ALL, FusedPart, join_fused
 from recon.map.ground.surface import find_floors
@@ -32,7 +33,6 @@ from recon.map.occupancy.bodies import Looks
 from recon.map.occupancy.moving import CellEvidence, cell_evidence, find_moved
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
-from recon.map.submaps import Submap
 from recon.stereo.frame import filter_cloud
 
 _POINTS: Final = "points"

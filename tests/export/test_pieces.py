@@ -15,8 +15,7 @@ from recon.core.errors import MeshingError, OutputError
 from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
 from recon.export.mesh import cut
 from recon.export.mesh.pieces import export_mesh
-from recon.export.mesh.poisson import MeshSettings
-from recon.export.mesh.voxels import reconstruct_map_surface
+from recon.export.mesh.poisson import MeshSettings, reconstruct_map_surface
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import write_ply
 from recon.map.tiles import Tiles

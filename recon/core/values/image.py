@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
-from recon.core.shown import Shown
+from recon.core.lazy import Shown
 from recon.core.values.arrays import (
     Bool,
     Float32,

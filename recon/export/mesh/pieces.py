@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from recon.core.errors import MeshingError
+from recon.core.geometry.se3 import apply, rotate
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.machine import available_cores
 from recon.core.progress import tracked
@@ -30,10 +32,15 @@ from recon.export.mesh.cut import (
     open_faces,
     with_faces,
 )
-from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
-from recon.export.mesh.surveyed import write_surveyed
-from recon.export.mesh.voxels import reconstruct_map_surface
+from recon.export.mesh.poisson import (
+    OVERLAP_M,
+    MeshSettings,
+    reconstruct_map_surface,
+    reconstruct_mesh,
+)
 from recon.export.product import Made, Order
+from recon.io.atomic import write_text
+from recon.io.models.las import check_crs
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.map.cut import Rectangle
@@ -271,3 +278,37 @@ def _without_crumbs(path: Path, kept: Bool) -> MeshPiece:
         else:
             path.unlink()
     return MeshPiece(path, len(mesh.vertices), len(mesh.faces))
+
+
+_ROUND_M: Final = 100.0
+
+
+def write_surveyed(
+    order: Order, mesh: TriangleMesh, folder: Path, formats: Sequence[str]
+) -> dict[str, Any]:
+    """Write a mesh, map axes, once more into a folder; return its figures.
+
+    Its axes are east, north and up. ``offset.xyz`` has what is to be added to its coordinates:
+    hundreds of metres to the east and north; ``mesh.prj`` the coordinate system, if it is known.
+    Without a survey nothing is written.
+    """
+    if order.survey is None:
+        return {}
+    T_survey_map = order.T_survey_map
+    offset_m = np.array([*(np.floor(T_survey_map[:2, 3] / _ROUND_M) * _ROUND_M), 0.0])
+    T_mesh_map = T_survey_map.copy()
+    T_mesh_map[:3, 3] -= offset_m
+    normals = None if mesh.normals is None else rotate(T_mesh_map, mesh.normals.astype(np.float64))
+    moved = replace(
+        mesh,
+        vertices=apply(T_mesh_map, mesh.vertices.astype(np.float64)).astype(np.float32),
+        normals=None if normals is None else normals.astype(np.float32),
+    )
+    for suffix in dict.fromkeys(formats):
+        write_mesh(folder / f"mesh.{suffix}", moved, "map")
+    text = " ".join(f"{metres:.0f}" for metres in offset_m)
+    write_text(folder / "offset.xyz", f"{text}\n")
+    if order.crs is not None:
+        wkt = check_crs(order.crs).to_wkt("WKT1_ESRI")
+        write_text(folder / "mesh.prj", f"{wkt}\n")
+    return {"mesh_offset_m": offset_m.tolist()}

@@ -1,4 +1,7 @@
-"""Screened Poisson reconstruction of a cloud, trimmed to where there is data."""
+"""The surface of a cloud: by screened Poisson reconstruction, or through the voxels of a map.
+
+Both are trimmed to where there is data; decision 0036.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,7 @@ from recon.core.values.arrays import Bool, Float32, Int32
 from recon.export.mesh.cut import drop_small_components, keep_vertices, vertex_normals
 from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes
+from recon.map.kernels.distance import surface_of
 from recon.stereo import open3d_clouds
 
 OVERLAP_M: Final = 3.0
@@ -234,3 +238,40 @@ def _near_data(vertices: Float32, xyz: Float32, spacings: float) -> Bool:
     # A lone point is far from its neighbours, and must not support a large patch of surface.
     local_m = np.minimum(local_m, 2 * np.median(local_m))
     return np.asarray(distance_m[:, 0] <= spacings * local_m[where])
+
+
+_OF_SEVENTH: Final = math.sqrt(math.pi / 7)
+"""Edge of the square that a point has for itself, as a share of the way to its seventh neighbour:
+a circle that wide holds seven."""
+
+
+def reconstruct_map_surface(
+    cloud: PointCloud,
+    settings: MeshSettings,
+    voxel_m: float,
+    wrong: Callable[[Float32], Bool] | None = None,
+) -> TriangleMesh:
+    """Return the surface that the points of a map lie on.
+
+    Cells are as wide as its voxels, or two, four … times where points are that far apart. They
+    have the same places in all parts of a map, so that these meet.
+
+    Args:
+        cloud: Points, with normals to the side that is free if possible; vertices take their
+            colours.
+        settings: Settings of the mesh.
+        voxel_m: Edge of a voxel of the map.
+        wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
+
+    Raises:
+        MeshingError: The points are too few, coincident or collinear, or no face was left.
+    """
+    cloud = oriented(cloud)
+    apart = _OF_SEVENTH * typical_spacing_m(cloud.xyz) / voxel_m
+    cell_m = voxel_m * 2 ** round(math.log2(max(apart, 1)))
+    # In float32 the kernel would lose what a large coordinate leaves no digits for.
+    origin = np.floor(cloud.xyz.min(axis=0) / cell_m).astype(np.float64)
+    farthest = settings.max_distance_spacings or math.inf
+    places, faces = surface_of(cloud.xyz / cell_m - origin, np.asarray(cloud.normals), farthest)
+    vertices = ((places + origin) * cell_m).astype(np.float32)
+    return trimmed((vertices, faces), cloud, settings, wrong)

@@ -20,6 +20,8 @@ from recon.map.builders import (
     CloudBuilder,
     OccupancyBuilder,
     OccupancySettings,
+    Submap,
+    SubmapSettings,
     ray_grain,
     thin_rays,
 )
@@ -27,7 +29,6 @@ from recon.map.fusion import FusionSettings, fusion_range_m
 from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
-from recon.map.submaps import Submap, SubmapSettings
 from recon.odometry.checked import StretchCounter
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.stereo.frame import ReconstructedFrame

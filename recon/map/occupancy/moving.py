@@ -14,7 +14,7 @@ straight edge on the ground it is three of eight, and nothing grows.
 
 Then what single frames saw decides (`bodies.py`): fences, hedges, edges and noise are looked
 through as well, but no frame sees a whole piece of them gone. Nor did a piece move whose surface is
-still there, beside it by no more than the error of depths (`error.py`). A point that its frames
+still there, beside it by no more than the error of depths. A point that its frames
 could not place in a voxel stays if something occupied is in its reach.
 
 The ground is in reach of the lowest part of what moved, outvotes the voxels that touch it, and
@@ -39,8 +39,15 @@ from recon.map.builders import (
     MIN_PROBABILITY,
     MISS_PROBABILITY,
 )
-from recon.map.occupancy.bodies import Looks, came_or_went, pairs_of, pieces_of, strides
-from recon.map.occupancy.error import Reaches, still_there
+from recon.map.occupancy.bodies import (
+    Looks,
+    Reaches,
+    came_or_went,
+    pairs_of,
+    pieces_of,
+    still_there,
+    strides,
+)
 from recon.map.occupancy.part import OccupancyPart
 
 _FREE: Final = np.float32(log_odds(0.35))

@@ -13,14 +13,14 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import orthonormalise
 from recon.core.text import counted
 from recon.core.values.arrays import Float64
+from recon.map.builders import Submap
 from recon.map.sessions.joining import T_one_other, link_by_frame
+from recon.map.sessions.placed import check_rays
 from recon.map.settings import DriveSettings
-from recon.map.store.finished import check_rays
 from recon.map.store.map_file import MapFile
 from recon.map.store.records import Key
 from recon.map.store.session import AXES, ENTRY, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
 from recon.map.store.trees import FRAMES, RAYS, RIG
-from recon.map.submaps import Submap
 from recon.odometry.health import stretches
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.places import path_lengths

@@ -15,8 +15,8 @@ from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64, array_in, tree_of
 from recon.io.files import reading
 from recon.look.rig import KnownRig, RefinedRig
+from recon.map.builders import Submap
 from recon.map.fusion import KNOWABLE, row_bytes
-from recon.map.store.database import MORE_ATTRIBUTES
 from recon.map.store.records import Store
 from recon.map.store.trees import (
     FRAMES,
@@ -33,7 +33,6 @@ from recon.map.store.trees import (
     rig_record,
     value_in,
 )
-from recon.map.submaps import Submap
 from recon.odometry.health import trusted_poses
 from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure
@@ -279,7 +278,7 @@ class SubmapEntry:
     frames: int
     voxels: int
     cells: int
-    more: tuple[str, ...] = ()  # attributes of its points that format 1 does not have
+    more: tuple[str, ...] = ()  # attributes of its points beside `KNOWABLE`
 
     @property
     def nbytes(self) -> int:
@@ -317,8 +316,6 @@ class Submaps:
     def add(self, submap: Submap, *, compress: bool = False) -> None:
         entry = _entry_of(submap)
         key = (self._session, submap.index)
-        if entry.more:
-            self.store.need_format(MORE_ATTRIBUTES)
         self.store.put(SUBMAP, key, tree_of(submap), compress=compress)
         content = asdict(entry).items()
         self.store.put(ENTRY, key, {name: value for name, value in content if value != ()})

@@ -1,4 +1,4 @@
-"""What comes back from the jobs of a batch, and which of it is unusual."""
+"""What comes back from the jobs of a batch, also of one that is running; what of it is unusual."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ import json
 import math
 import os
 import statistics
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from recon.core.errors import FormatError
 from recon.core.progress import series, stage
+from recon.io.atomic import is_locked
 from recon.io.files import read_text, reading
 from recon.run.batch.cluster import BatchOptions, Cluster
-from recon.run.batch.job import Job, Outcome, log_file
+from recon.run.batch.job import Job, Outcome, last_outcome, log_file
+from recon.run.batch.job_file import PLAN
+from recon.run.directory import lock_file
 from recon.run.run import SUMMARY
 
 ACCURACY: Final = (
@@ -196,3 +201,37 @@ def _far(name: str, values: Sequence[float]) -> list[float]:
     spread = _SIGMAS * statistics.median(abs(value - median) for value in values)
     spread = math.copysign(max(spread, _LEAST_SHARE * abs(median), abs(least)), least)
     return [(value - median) / spread for value in values]
+
+
+def watch_jobs(
+    folder: Path, jobs: Sequence[Job], every_s: float = 1.0
+) -> Iterator[list[JobResult]]:
+    """Yield how all jobs stand, every second until nobody runs the batch any more.
+
+    Raises:
+        FormatError: The folder is removed meanwhile.
+    """
+    done: dict[str, JobResult] = {}
+    running = True
+    while running:
+        running = is_locked(lock_file(folder))  # before the jobs, whose last state it then is
+        if not (folder / PLAN).is_file():
+            raise FormatError("the folder of the batch was removed", where=folder)
+        seen = [done.get(job.name) or _seen(job, folder, running=running) for job in jobs]
+        done.update((one.job.name, one) for one in seen if one.figures)
+        yield compare(seen)
+        if running:
+            time.sleep(every_s)
+
+
+def _seen(job: Job, folder: Path, *, running: bool) -> JobResult:
+    """Return how a job stands; what is half written is as if it were not there yet."""
+    last = Outcome()
+    try:
+        last = last_outcome(folder, job.name)
+        # A try that has not ended is written as one that broke.
+        if running and last.state == "broken" and not last.seconds:
+            last = replace(last, state="running", error="")
+        return result_of(job, last, folder)
+    except FormatError:
+        return JobResult(job, last)

@@ -15,15 +15,13 @@ from recon.core.values import FREE, OCCUPIED, OccupancyGrid, PointCloud, RayClou
 from recon.core.values.arrays import Bool
 from recon.core.values.grid import log_odds
 from recon.export.cloud import export_cloud
-from recon.map.builders import MAX_PROBABILITY, OccupancyBuilder, thin_rays
+from recon.map.builders import MAX_PROBABILITY, OccupancyBuilder, Submap, thin_rays
 from recon.map.drive.mapper import SubmapBuilder
 from recon.map.drive.sequence import map_sequence
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSurface
-from recon.map.occupancy.bodies import Looks, came_or_went
-from recon.map.occupancy.error import disagreement, frame_pairs, still_there
-from recon.map.submaps import Submap
+from recon.map.occupancy.bodies import Looks, came_or_went, disagreement, frame_pairs, still_there
 from recon.map.tiles import Tiles
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
