@@ -103,10 +103,7 @@ def write_disparity_files(
 
 
 def write_cloud_files(
-    frame: ReconstructedFrame,
-    mesh: TriangleMesh | None,
-    formats: Sequence[str],
-    folder: Path,
+    frame: ReconstructedFrame, mesh: TriangleMesh | None, formats: Sequence[str], folder: Path
 ) -> None:
     """Write cloud and mesh (PLY and ``formats``), and a project with the left image."""
     write_ply(folder / PAIR_CLOUD, frame.cloud)

@@ -26,11 +26,7 @@ _POINTS, _SURFACE = "points.npz", "surface.npz"
 
 
 def screened_poisson(
-    xyz: NDArray[Any],
-    normals: NDArray[Any],
-    depth: int,
-    scale: float,
-    point_weight: float,
+    xyz: NDArray[Any], normals: NDArray[Any], depth: int, scale: float, point_weight: float
 ) -> tuple[Float32, Int32, Float32]:
     """Return the closed surface through points (N, 3) with outward unit normals, all finite.
 

@@ -53,9 +53,18 @@ class CloudBuilder:
         ``confidence`` None = 1, ``sigma_m`` None = all equally precise. What one of the clouds does
         not have, the map does not have.
         """
-        self._check(cloud)
-        if len(cloud):
-            self._know(tuple(name for name in self._known if name in cloud.arrays))
+        _check_cloud(cloud, "world", "the fused map")
+        limit_m = self._settings.voxel_m * (voxels.KEY_LIMIT - 1)
+        if len(cloud) and np.abs(cloud.xyz).max() > limit_m:
+            raise MappingError(
+                "a point is too far from the origin for this voxel size",
+                got=f"{np.abs(cloud.xyz).max():.0f} m",
+                expected=f"at most {limit_m:.0f} m",
+            )
+        if len(cloud):  # forget what this cloud does not have
+            known = tuple(name for name in self._known if name in cloud.arrays)
+            self._sums = self._sums._replace(sums=sums_of(self._sums.sums, self._known, known))
+            self._known = known
         points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), self._values(cloud))
         self._sums = voxels.add_points(self._sums, points, self._settings.voxel_m, self._frames)
         self._frames += 1
@@ -77,11 +86,6 @@ class CloudBuilder:
         self._known, self._frames = part.known if frames else ALL, frames
         empty = voxels.make_sums(max(1, len(part)), sums_in(self._known) - 4)
         self._sums = voxels.add_rows(empty, part.keys, part.sums, part.information, part.frames)
-
-    def _know(self, known: tuple[str, ...]) -> None:
-        """Forget what one of the clouds does not have."""
-        self._sums = self._sums._replace(sums=sums_of(self._sums.sums, self._known, known))
-        self._known = known
 
     @property
     def nbytes(self) -> int:
@@ -105,17 +109,6 @@ class CloudBuilder:
         for each in columns.keys() & found.keys():
             values[:, columns[each].start - 4 : columns[each].stop - 4] = each.averaged(found[each])
         return values
-
-    def _check(self, cloud: PointCloud) -> None:
-        """Refuse what would silently spoil the map."""
-        _check_cloud(cloud, "world", "the fused map")
-        limit_m = self._settings.voxel_m * (voxels.KEY_LIMIT - 1)
-        if len(cloud) and np.abs(cloud.xyz).max() > limit_m:
-            raise MappingError(
-                "a point is too far from the origin for this voxel size",
-                got=f"{np.abs(cloud.xyz).max():.0f} m",
-                expected=f"at most {limit_m:.0f} m",
-            )
 
 
 _FIRST_POINTS: Final = 1 << 12
@@ -164,7 +157,15 @@ class OccupancyBuilder:
         ``count`` is the number of points that each stands for, None = 1.
         """
         _check_cloud(cloud, "camera", "the occupancy map")
-        _check_pose(T_world_camera, self._settings.resolution_m)
+        if not np.isfinite(T_world_camera).all():
+            raise MappingError("a pose to map is not finite")
+        away_m = float(np.abs(T_world_camera[:3, 3]).max())
+        if away_m > (far_m := self._settings.resolution_m * (voxels.KEY_LIMIT / 2)):
+            raise MappingError(
+                "the camera is too far from the origin for this resolution",
+                got=f"{away_m:.0f} m",
+                expected=f"at most {far_m:.0f} m",
+            )
         rays = frame_rays(cloud, self._T_map_world @ T_world_camera, self._settings)
         self._evidence = raycast.cast_rays(self._evidence, rays, SPREAD_SIGMAS)
         self._points = voxels.add_points(self._points, _hits(rays), 1.0, 0)
@@ -259,18 +260,6 @@ def _check_cloud(cloud: PointCloud, frame: Frame, what: str) -> None:
         raise MappingError(f"{what} takes clouds in {frame} axes", got=cloud.frame, expected=frame)
     if not all(np.isfinite(values).all() for values in cloud.arrays.values()):
         raise MappingError("a point to map is not finite")
-
-
-def _check_pose(T_world_camera: NDArray[Any], resolution_m: float) -> None:
-    if not np.isfinite(T_world_camera).all():
-        raise MappingError("a pose to map is not finite")
-    far_m = resolution_m * (voxels.KEY_LIMIT / 2)
-    if np.abs(T_world_camera[:3, 3]).max() > far_m:
-        raise MappingError(
-            "the camera is too far from the origin for this resolution",
-            got=f"{np.abs(T_world_camera[:3, 3]).max():.0f} m",
-            expected=f"at most {far_m:.0f} m",
-        )
 
 
 _UNITS_PER_CELL: Final = 64

@@ -165,7 +165,18 @@ class FusedPart:
         for each, columns in columns_in(self.known).items():
             if each.fused == "direction":
                 sums[:, columns] = rotate(T_new_world, sums[:, columns])
-        return _merged(replace(self, keys=voxels.pack_keys(cells), sums=sums))
+        # One row for each voxel, in the order of the first row of each.
+        keys = voxels.pack_keys(cells)
+        order = np.argsort(keys, kind="stable")
+        begin = np.flatnonzero(np.diff(keys[order], prepend=-1))
+        merged = FusedPart(
+            keys[order][begin],
+            np.add.reduceat(sums[order], begin, axis=0),
+            np.maximum.reduceat(self.information[order], begin),
+            np.maximum.reduceat(self.frames[order], begin),
+            self.known,
+        )
+        return merged.select(np.argsort(order[begin], kind="stable"))
 
     def cloud(self, voxel_m: float, least: int) -> PointCloud:
         """Return one point per voxel that `enough` frames saw, frame ``world``, as first seen.
@@ -241,21 +252,6 @@ def join_fused(parts: Iterable[FusedPart]) -> FusedPart:
         total.keys[:n], total.sums[:n], total.information[:n], total.frames[:n], known
     )
     return found if n else found.knowing(())
-
-
-def _merged(part: FusedPart) -> FusedPart:
-    """Return one row for each voxel, in the order of the first row of each."""
-    order = np.argsort(part.keys, kind="stable")
-    keys = part.keys[order]
-    begin = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
-    merged = FusedPart(
-        keys[begin],
-        np.add.reduceat(part.sums[order], begin, axis=0),
-        np.maximum.reduceat(part.information[order], begin),
-        np.maximum.reduceat(part.frames[order], begin),
-        part.known,
-    )
-    return merged.select(np.argsort(order[begin], kind="stable"))
 
 
 def _rounded(values: Float32, bits: int) -> Float32:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from typing_extensions import Self
 
 from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.kernels.voxels import are_among, distinct_keys, pack_keys, unpack_keys
@@ -72,6 +71,8 @@ class Tiles:
     Attributes:
         extent: Smallest x and y of the cells that submaps observed, and the largest plus one.
         submap_of_frame: int64 (N,), number of the submap of each frame; -1 between two drives.
+        looks: What single frames saw: what they show to have moved is left out of clouds. None = it
+            is not known, and nothing is left out.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class Tiles:
         self._parts = TileParts(self.edge_m, path)
         self._chain = DriveChain(self._parts)
         self._known: tuple[str, ...] = ALL
-        self._looks: Looks | None = None
+        self.looks: Looks | None = None
         self.extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
         self.submap_of_frame: Int64 = np.zeros(0, np.int64)
 
@@ -132,16 +133,6 @@ class Tiles:
         tiles = cls(config, T_map_world, halvings, path)
         cut = Cut.joined([tiles._parts.adopt(file) for file in files])
         return tiles if tiles._take(cut, drives) else None
-
-    @property
-    def looks(self) -> Looks | None:
-        """What single frames saw, without which nothing is taken out; None = it is not known."""
-        return self._looks
-
-    def with_looks(self, looks: Looks | None) -> Self:
-        """Leave out of clouds what ``looks`` show to have moved; None = nothing."""
-        self._looks = looks
-        return self
 
     @property
     def resolution_m(self) -> float:
@@ -272,13 +263,13 @@ class Tiles:
     def _moved_rows(self, key: TileKey, drive: int, fused: FusedPart) -> Bool:
         """Return which rows of what a drive fused in a tile and its margin are of what moved."""
         fusion = self.config.fusion
-        if not fusion.remove_moving or self._looks is None:
+        if not fusion.remove_moving or self.looks is None:
             return np.zeros(len(fused), np.bool_)
         points = apply(self._T_map_world, fused.points(fusion.voxel_m))
         counted = fused.enough(self._least_frames, fusion.voxel_m)
         voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
         sigma_m = fused.frame_sigma_m
-        return find_moved(points, sigma_m, counted, voxels, evidence, self._looks)
+        return find_moved(points, sigma_m, counted, voxels, evidence, self.looks)
 
 
 _EVIDENCE: Final = "evidence"
@@ -302,8 +293,16 @@ class DriveChain:
 
     def joined(self, key: TileKey, *, note: bool) -> OccupancyPart:
         """Join what all drives observed in a tile; ``note`` what each saw, for `evidence`."""
-        drives = self._drives(key)
-        return _outdone(self._noted(key, drives) if note else (part for _, part in drives))
+
+        def seen() -> Iterator[OccupancyPart]:
+            for drive, part in self._drives(key):
+                if note:
+                    cells, evidence = cell_evidence(part)
+                    noted = {"cells": cells, "log_odds": evidence}
+                    self._parts.put(_EVIDENCE, key, noted, drive)
+                yield part
+
+        return _outdone(seen())
 
     def evidence(self, key: TileKey, drive: int) -> CellEvidence:
         """Return the `cell_evidence` of a drive, noted when the tile was joined."""
@@ -324,15 +323,6 @@ class DriveChain:
         kept = seen.select(~are_among(pack_keys(seen.keys >> BLOCK_BITS), changed))
         return join_voxels([kept, anew], seen.resolution_m)
 
-    def _noted(
-        self, key: TileKey, drives: Iterable[tuple[int, OccupancyPart]]
-    ) -> Iterator[OccupancyPart]:
-        """Return the parts of drives, with a note of what each saw."""
-        for drive, part in drives:
-            cells, seen = cell_evidence(part)
-            self._parts.put(_EVIDENCE, key, {"cells": cells, "log_odds": seen}, drive)
-            yield part
-
     def _drives(
         self,
         key: TileKey,
@@ -349,11 +339,13 @@ class DriveChain:
         numbered = merge(own, sorted((after or {}).items()), key=itemgetter(0))
         for drive, parts in groupby(numbered, key=self.drive):
             # Joined one by one, so that a place passed often takes no more memory than others.
-            yield drive, join_occupancy(_in_blocks(part, blocks) for _, part in parts)
-
-
-def _in_blocks(part: OccupancyPart, blocks: Int64 | None) -> OccupancyPart:
-    return part if blocks is None else part.select(are_among(part.rows.blocks, blocks))
+            yield (
+                drive,
+                join_occupancy(
+                    part if blocks is None else part.select(are_among(part.rows.blocks, blocks))
+                    for _, part in parts
+                ),
+            )
 
 
 def _outdone(drives: Iterable[OccupancyPart]) -> OccupancyPart:

@@ -66,13 +66,9 @@ def cache_parent() -> Path:
         return beside
     # Unlike those of Path, these functions take no home and one of somebody else for what they are.
     users = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111
-    return users / "recon" if users.is_absolute() and _may_make(users) else _temporary()
-
-
-def _may_make(folder: Path) -> bool:
-    """Return whether a folder can be written, or made where its nearest parent is."""
-    nearest = next(path for path in (folder, *folder.parents) if os.path.exists(path))  # noqa: PTH110
-    return os.access(nearest, os.W_OK)
+    nearest = next(path for path in (users, *users.parents) if os.path.exists(path))  # noqa: PTH110
+    usable = users.is_absolute() and os.access(nearest, os.W_OK)
+    return users / "recon" if usable else _temporary()
 
 
 def _temporary() -> Path:
@@ -88,11 +84,7 @@ def _temporary() -> Path:
 
 
 def cache_folder(parent: Path, source: Path, package: Path = PACKAGE) -> Path:
-    """Return the folder for a file of kernels as it and its imports are; earlier ones are removed.
-
-    Raises:
-        OSError: A file cannot be read.
-    """
+    """Return the folder for a file of kernels and its imports as they are; others are removed."""
     digest = hashlib.sha256()
     for path in with_imports(source, package):
         digest.update(_read(path))

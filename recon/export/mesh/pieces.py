@@ -101,11 +101,7 @@ def mesh_product(order: Order, path: Path) -> Made:
 
 
 def export_mesh(
-    tiles: Tiles,
-    settings: MeshSettings,
-    path: Path,
-    cloud: Path,
-    threads: int | None = None,
+    tiles: Tiles, settings: MeshSettings, path: Path, cloud: Path, threads: int | None = None
 ) -> Made:
     """Write the surface of a map, its pieces if there are several, and a MeshLab project.
 

@@ -83,11 +83,7 @@ class Drive:
         """
         if self.source.live:
             return poses_first(
-                self.source,
-                self.reconstructor,
-                self.mapper.register,
-                self._map_behind,
-                tracks,
+                self.source, self.reconstructor, self.mapper.register, self._map_behind, tracks
             )
         return self._in_order()
 

@@ -28,12 +28,7 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.kernels.voxels import find_keys, pack_keys, unpack_keys
 from recon.core.values import PointCloud, RayCloud
 from recon.core.values.arrays import Bool, Float64, Int8, Int64
-from recon.map.builders import (
-    RAYS_PER_VOXEL,
-    SPREAD_SIGMAS,
-    OccupancySettings,
-    frame_rays,
-)
+from recon.map.builders import RAYS_PER_VOXEL, SPREAD_SIGMAS, OccupancySettings, frame_rays
 from recon.map.kernels.looks import count_look, rays_towards
 from recon.map.kernels.raycast import (
     BLOCK_BITS,

@@ -72,7 +72,7 @@ def place_map(map_: MapFile, settings: DriveSettings, threads: int = 1) -> Place
         placed.corrections,
         drives=placed.drives,
     )
-    return _with_path(map_, tiles.with_looks(_looks(map_, settings)))
+    return _with_path(map_, settings, tiles)
 
 
 def place_map_on(
@@ -100,7 +100,7 @@ def place_map_on(
     files = [folder / f"tiles-{n}" for n in range(len(groups))]
     each(partial(_make_tiles, file, settings, taken), [*zip(groups, files, strict=True)])
     tiles.adopt(files)
-    return _with_path(map_, tiles.with_looks(_looks(map_, settings)))
+    return _with_path(map_, settings, tiles)
 
 
 class PlacedSubmaps:
@@ -221,21 +221,17 @@ def _without_place(map_: MapFile, session: Session) -> frozenset[int]:
     return frozenset(frames.tolist())
 
 
-def _with_path(map_: MapFile, tiles: Tiles) -> PlacedMap:
-    """Return the tiles of a map with the paths of its linked drives."""
-    sessions = map_.linked
-    paths = [apply(s.T_map_world, s.trajectory.positions_m) for s in sessions]
-    placed = map_.placed
-    good = [placed[session.number] for session in sessions]
-    return PlacedMap(tiles, _with_gaps(paths, np.nan), _with_gaps(good, False))
-
-
-def _with_gaps(parts: Sequence[np.ndarray], gap: float) -> np.ndarray:
-    """Return rows of several drives, with a row in between."""
-    rows = [parts[0]]
-    for part in parts[1:]:
-        rows += [np.full_like(part[:1], gap), part]
-    return np.concatenate(rows)
+def _with_path(map_: MapFile, settings: DriveSettings, tiles: Tiles) -> PlacedMap:
+    """Return the tiles of a map with what its frames saw, and the paths of its linked drives."""
+    tiles.looks = _looks(map_, settings)
+    paths, good, placed = list[Float64](), list[Bool](), map_.placed
+    for session in map_.linked:
+        if paths:  # a row between two drives
+            paths.append(np.full((1, 3), np.nan))
+            good.append(np.zeros(1, np.bool_))
+        paths.append(apply(session.T_map_world, session.trajectory.positions_m))
+        good.append(placed[session.number])
+    return PlacedMap(tiles, np.concatenate(paths), np.concatenate(good))
 
 
 def _shares(items: Sequence[Any], workers: int) -> list[Any]:
@@ -274,7 +270,7 @@ def _make_tiles(
     keys, file = task
     tiles = taken(path=file)
     with closing(MapFile.open(map_file)) as map_:
-        tiles.with_looks(_looks(map_, settings))
+        tiles.looks = _looks(map_, settings)
         for key in keys:
             tiles.make_voxels(key)
             tiles.cloud(key)

@@ -69,7 +69,7 @@ def _files_of(path: Path) -> list[Path]:
     return [path.with_name(path.name + end) for end in ("", "-wal", "-shm", "-journal")]
 
 
-def _connect(path: Path | None, *, read_only: bool = False) -> sqlite3.Connection:
+def connect(path: Path | None, *, read_only: bool = False) -> sqlite3.Connection:
     """Return a connection without transactions of its own; the lock of the store guards it."""
     name: str | Path = "" if path is None else path
     if path is not None and read_only:
@@ -188,7 +188,7 @@ class Store:
             for file in _files_of(path):
                 file.unlink(missing_ok=True)
             path.parent.mkdir(parents=True, exist_ok=True)
-            with _closed_on_error(_connect(path)) as database:
+            with _closed_on_error(connect(path)) as database:
                 _make_tables(database)
                 _begin_to_write(database)
         return cls(database, path, cache_bytes)
@@ -201,7 +201,7 @@ class Store:
                 pass
             for file in _files_of(path):
                 refuse_special(file)
-            database = _connect(path, read_only=read_only)
+            database = connect(path, read_only=read_only)
         with _closed_on_error(database):
             with reading(path):
                 check_format(database, path)
@@ -216,7 +216,7 @@ class Store:
     @classmethod
     def temporary(cls, *, cache_bytes: int = CACHE_BYTES) -> Self:
         """Begin a store in a temporary file, which is gone when the store is closed."""
-        with writing(None), _closed_on_error(_connect(None)) as database:
+        with writing(None), _closed_on_error(connect(None)) as database:
             database.execute("PRAGMA journal_mode = OFF")
             _make_tables(database)
             database.execute("BEGIN")
@@ -340,9 +340,21 @@ class Store:
         self.close()
 
     def _insert(self, kind: str, name: str, text: str, content: Sequence[Bytes]) -> None:
-        checksum = _checksum(kind, name, text, *content)
+        head = (kind, name, text, _checksum(kind, name, text, *content))
+        insert = "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, {})"
         with self._lock, writing(self.path):
-            _write_record(self._database, (kind, name, text, checksum), content)
+            if sys.version_info >= (3, 11):
+                # Bound to a statement, bytes are copied twice, which for a submap is more memory
+                # than the submap itself: room is made for them, and written piece by piece.
+                size = sum(map(len, content))
+                values = (*head, size)
+                row = self._database.execute(insert.format("zeroblob(?)"), values).lastrowid
+                if size:
+                    with self._database.blobopen("record", "content", row) as blob:
+                        for piece in content:
+                            blob.write(piece)
+            else:
+                self._database.execute(insert.format("?"), (*head, b"".join(content)))
             self.cache.drop((kind, _key(name)))
 
     def _row(self, kind: str, name: str) -> tuple[str, _Content, int]:
@@ -354,26 +366,6 @@ class Store:
         row, size, text, checksum = found
         content = _Content(self._database, row, size, _checksum(kind, name, text))
         return text, content, checksum
-
-
-def _write_record(
-    database: sqlite3.Connection, head: tuple[str, str, str, int], content: Sequence[Bytes]
-) -> None:
-    """Insert a record (kind, key, tree, checksum), in place of one of the same kind and key.
-
-    Bound to a statement, bytes are copied twice, which for a submap is more memory than the submap
-    itself; so room is made for them, and they are written into it piece by piece.
-    """
-    insert = "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, {})"
-    if sys.version_info >= (3, 11):
-        size = sum(map(len, content))
-        row = database.execute(insert.format("zeroblob(?)"), (*head, size)).lastrowid
-        if size:
-            with database.blobopen("record", "content", row) as blob:
-                for piece in content:
-                    blob.write(piece)
-    else:
-        database.execute(insert.format("?"), (*head, b"".join(content)))
 
 
 def _name(key: Key) -> str:

@@ -26,7 +26,7 @@ from recon.core.values import (
     Trajectory,
     check_size,
 )
-from recon.core.values.arrays import Float64, UInt8, array_in, frozen_array
+from recon.core.values.arrays import Float64, array_in, frozen_array
 from recon.look.fault import active
 from recon.look.fit import FittedFault
 from recon.look.rig import KnownRig
@@ -136,7 +136,9 @@ def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | me
     if compress and array.size:
         # Runs and single bytes: as small as with a search for repeats, in half the time.
         packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, 9, zlib.Z_RLE)
-        packed = packer.compress(_planes(flat).tobytes()) + packer.flush()
+        columns = flat.reshape(-1, _columns(flat.shape))
+        planes = columns.view(np.uint8).reshape(*columns.shape, flat.dtype.itemsize)
+        packed = packer.compress(planes.transpose(1, 2, 0).tobytes()) + packer.flush()
         if len(packed) < len(content):
             content, codec = packed, _ZLIB
     return [little.dtype.str, list(array.shape), layout, codec], content
@@ -161,14 +163,6 @@ def _unpack(claim: _Claim, packed: bytearray) -> NDArray[Any]:
 
 def _columns(shape: Sequence[int]) -> int:
     return shape[1] if len(shape) == 2 and 0 < shape[1] <= _NARROW else 1
-
-
-def _planes(array: NDArray[Any]) -> UInt8:
-    """Return uint8 (columns, bytes of a number, N)."""
-    size = array.dtype.itemsize
-    columns = array.reshape(-1, _columns(array.shape))
-    split = columns.view(np.uint8).reshape(-1, columns.shape[1], size)
-    return np.asarray(split.transpose(1, 2, 0))
 
 
 Value = TypeVar("Value")
@@ -245,9 +239,11 @@ RAY_BYTES: Final = 10  # of one ray in a record; a frame has at most one for eac
 
 def rays_record(rays: RayCloud, grain: RayGrain) -> dict[str, Any]:
     """Return rays as a tree of arrays and plain values."""
+    # Between neighbours in the image: small numbers, which compress, written as positive ones of
+    # which every second stands for a step back (0, −1, 1, −2 become 0, 1, 2, 3).
+    steps = np.diff(rays.places, axis=0, prepend=np.zeros((1, 3), np.int16))
     return {
-        # Of neighbours in the image: small numbers, which compress.
-        "steps": _zigzag(np.diff(rays.places, axis=0, prepend=np.zeros((1, 3), np.int16))),
+        "steps": ((steps << 1) ^ (steps >> 15)).view(np.uint16),
         "sigma_m": rays.sigma_m,
         "confidence": rays.confidence,
         "count": rays.count,
@@ -263,20 +259,11 @@ def rays_in(content: Mapping[str, Any]) -> tuple[RayCloud, RayGrain]:
     if not (ordered and np.isfinite(sizes_m).all()):
         raise FormatError("sizes of the rays are impossible", got=sizes_m)
     steps = frozen_array("steps", content["steps"], np.uint16, (None, 3))
-    places = np.cumsum(_unzigzag(steps), axis=0, dtype=np.int16)
+    places = np.cumsum(((steps >> 1) ^ -(steps & 1)).view(np.int16), axis=0, dtype=np.int16)
     if array_in(content, "sigma_m", np.float16, (len(places),)).min(initial=0.0) < 0:
         raise FormatError("a ray of the map has a negative deviation")
     parts = {name: content[name] for name in ("sigma_m", "confidence", "count")}
     return value_in(RayCloud, {"places": places, **parts, "unit_m": grain.unit_m}), grain
-
-
-def _zigzag(steps: NDArray[np.int16]) -> NDArray[np.uint16]:
-    """Return steps of either sign as small positive numbers: 0, −1, 1, −2 become 0, 1, 2, 3."""
-    return ((steps << 1) ^ (steps >> 15)).view(np.uint16)
-
-
-def _unzigzag(codes: NDArray[np.uint16]) -> NDArray[np.int16]:
-    return ((codes >> 1) ^ -(codes & 1)).view(np.int16)
 
 
 RIG: Final = "rig"

@@ -116,7 +116,11 @@ def work_off(
 
 def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
     """Return the result of a job, with the figures of its summary."""
-    size = folder_bytes(folder / job.name)
+    size = 0
+    for place, _, names in os.walk(folder / job.name):
+        for name in names:
+            with suppress(OSError):  # others may be writing or removing them
+                size += Path(place, name).lstat().st_size
     if outcome.state != "succeeded":
         return JobResult(job, outcome, bytes=size)
     path = folder / job.name / SUMMARY
@@ -153,16 +157,6 @@ def urgency(facts: Mapping[str, Any], figures: Mapping[str, float]) -> tuple[Any
     untrusted = figures.get("frames_not_trusted", 0.0) / max(1.0, figures.get("frames", 1.0))
     drift = next((figures[name] for name in _DRIFT if name in figures), 0.0)
     return facts["state"] != "failed", -untrusted, -drift, "remark" not in facts
-
-
-def folder_bytes(folder: Path) -> int:
-    """Return the size of all files in a folder, which others may be writing or removing."""
-    size = 0
-    for place, _, names in os.walk(folder):
-        for name in names:
-            with suppress(OSError):
-                size += Path(place, name).lstat().st_size
-    return size
 
 
 def accuracies(figures: Iterable[Mapping[str, float]]) -> list[str]:

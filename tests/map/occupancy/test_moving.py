@@ -103,7 +103,8 @@ def _tiles(*drives: Drive, remove: bool = True) -> Tiles:
     tiles = Tiles.of_submaps(submaps, config, T_MAP_WORLD, drives=[1] * len(drives))
     poses = np.stack([pose for drive in drives for pose in drive.poses])
     rays = [cloud for drive in drives for cloud in drive.rays]
-    return tiles.with_looks(Looks(config.occupancy, T_MAP_WORLD @ poses, rays.__getitem__))
+    tiles.looks = Looks(config.occupancy, T_MAP_WORLD @ poses, rays.__getitem__)
+    return tiles
 
 
 def _clouds(*drives: Drive) -> list[PointCloud]:
