@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Bool
-from recon.export.occupancy import GROUND_SHARE, grounds
+from recon.export.occupancy import GROUND_SHARE, Flattening
 from recon.export.product import Made, Order
 from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
@@ -161,7 +161,7 @@ def e57_product(order: Order, path: Path) -> Made:
 
 def _ground_of(placed: PlacedMap) -> AreGround:
     """Return what tells which points of a tile are ground; far from the path, none is known."""
-    tiles, known = placed.tiles, dict(grounds(placed))
+    tiles, known = placed.tiles, dict(Flattening(placed).grounds())
 
     def are_ground(cloud: PointCloud) -> Bool:
         if not len(cloud):

@@ -10,7 +10,7 @@ from recon.core.errors import MappingError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Float64, Int32
-from recon.export.occupancy import Flattening, grounds, make_grid
+from recon.export.occupancy import Flattening
 from recon.export.product import Made, Order
 from recon.export.rasters import ground_slopes
 from recon.io.models.nav2 import write_nav2_costs
@@ -93,14 +93,14 @@ def gridmap_product(order: Order, folder: Path) -> Made:
     ``occupancy`` (0 to 100) of the flat grid, and ``traversability`` (1 to 0) by the costs of the
     robot of the settings; NaN = unknown.
     """
-    flat, _, _ = make_grid(order.placed)
+    flat, _, _ = Flattening(order.placed).grid()
     costs, warnings = make_costmap(order.map, order.placed)
     heights, slopes = np.full((2, *flat.cells.shape), np.nan)
     x_m, y_m = (
         origin_m + (np.arange(cells) + 0.5) * flat.resolution_m
         for origin_m, cells in zip(flat.origin_m, flat.cells.shape[::-1], strict=True)
     )
-    for bounds, ground in grounds(order.placed):
+    for bounds, ground in Flattening(order.placed).grounds():
         sides = zip((y_m, x_m), bounds.low[::-1], bounds.high[::-1], strict=True)
         part = tuple(slice(*np.searchsorted(at_m, ends_m)) for at_m, *ends_m in sides)
         xy_m = np.stack(np.meshgrid(x_m[part[1]], y_m[part[0]]), axis=-1)

@@ -13,7 +13,7 @@ from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64, UInt8
 from recon.export.cloud import even_sample
-from recon.export.occupancy import make_grid
+from recon.export.occupancy import Flattening
 from recon.export.product import DriveImages, Made, Order
 from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
@@ -33,7 +33,7 @@ def mcap_product(order: Order, folder: Path) -> Made:
     a survey are a frame, ``survey``, in which that of the map lies.
     """
     warnings = []
-    grid, height_m, _ = make_grid(order.placed)
+    grid, height_m, _ = Flattening(order.placed).grid()
     images: dict[int, DriveImages] = {}
     try:
         images = {one.session.number: one for one in order.drives}

@@ -50,11 +50,13 @@ GROUND_SHARE: Final = 0.95
 # start.
 _MARGIN_M: Final = 5.0
 MadeGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
+"""A grid, the height at which something carried the camera above the ground (None = unknown, or not
+at one height), and what a user of the grid should know."""
 
 
 def grid_product(order: Order, path: Path) -> Made:
     """Write the flat grid as Nav2 reads it, given the path of its YAML file."""
-    grid, height_m, warnings = make_grid(order.placed)
+    grid, height_m, warnings = Flattening(order.placed).grid()
     write_nav2(path.with_suffix(""), grid)
     rows, columns = grid.cells.shape
     figures = {
@@ -67,21 +69,6 @@ def grid_product(order: Order, path: Path) -> Made:
         "T_base_camera": base_axes(order.map.first.T_map_world, height_m).tolist(),
     }
     return Made(figures, warnings, grid)
-
-
-def make_grid(placed: PlacedMap) -> MadeGrid:
-    """Flatten the voxels of a map above its ground.
-
-    Returns:
-        The grid, the height at which something carried the camera above the ground (None = unknown,
-        or not at one height), and what a user of the grid should know.
-    """
-    return Flattening(placed).grid()
-
-
-def grounds(placed: PlacedMap) -> Iterator[tuple[Rectangle, GroundSurface]]:
-    """Yield the tiles of a map that are near the path, and the ground in each."""
-    return Flattening(placed).grounds()
 
 
 Finish = Callable[[OccupancyGrid, GroundSurface, Int32], OccupancyGrid]
@@ -107,6 +94,7 @@ class Flattening:
         self._ground_depths: list[Float64] = [np.zeros(0)]
 
     def grid(self) -> MadeGrid:
+        """Flatten the voxels of the map above its ground."""
         if self._tiles.extent[0] == self._tiles.extent[1]:
             raise MappingError("nothing was observed: there is no map to flatten")
         settings, driven = self._along_the_path()

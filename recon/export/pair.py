@@ -66,12 +66,10 @@ def _surface(
 
 
 def _coverage(mesh: TriangleMesh, cloud: PointCloud, settings: MeshSettings) -> float:
-    """Return the share of the measured points that lie on a mesh; of all, if none is measured.
-
-    Of a closed body, on its front, whose vertices come first.
-    """
+    """Return the fraction of the measured points, if there are any, on the front of a mesh."""
     measured = cloud.only_measured()
     if settings.pair_solid_m is not None:
+        # Of a closed body, vertices in front come first.
         front = (mesh.faces < len(mesh.vertices) // 2).all(axis=1)
         mesh = replace(mesh, faces=mesh.faces[front])
     return mesh_coverage(mesh, measured if len(measured) else cloud)

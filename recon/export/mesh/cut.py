@@ -51,7 +51,11 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
     a, b, c, d = np.split(new, np.cumsum([len(one), len(one), len(two)]))
     split = ((one[:, 0], a, b), (two[:, 0], two[:, 1], c), (two[:, 0], c, d))
     faces = np.concatenate([whole, *(np.stack(corners, axis=1) for corners in split)])
-    return with_faces(_with_cuts(mesh, edges, away, plane), faces.astype(np.int32))
+    first, last = edges.T
+    share = (away[first] / (away[first] - away[last])).astype(np.float64)
+    met = between(mesh.vertices, edges, share).astype(np.float32)
+    met[:, plane.axis] = np.float32(plane.at_m)
+    return with_faces(with_vertices(mesh, met, edges, share), faces.astype(np.int32))
 
 
 def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64) -> TriangleMesh:
@@ -82,15 +86,6 @@ def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
     start = (np.argmax(odd, axis=1) + corners - 1) % 3
     order = (start[:, None] + np.arange(3)) % 3
     return np.asarray(np.take_along_axis(faces, order, axis=1), dtype=np.int32)
-
-
-def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) -> TriangleMesh:
-    """Return the mesh with a new vertex where each edge (E, 2) meets the plane."""
-    first, last = edges.T
-    share = (away[first] / (away[first] - away[last])).astype(np.float64)
-    new = between(mesh.vertices, edges, share).astype(np.float32)
-    new[:, plane.axis] = np.float32(plane.at_m)
-    return with_vertices(mesh, new, edges, share)
 
 
 def with_faces(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
@@ -135,7 +130,26 @@ def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
     vertices = mesh.vertices.copy()
     vertices[rows[near]] = found.feet[near]
     vertices[rows[near], plane.axis] = np.float32(plane.at_m)
-    return _with_inserted(replace(mesh, vertices=vertices), plane, border, reach_m)
+    mesh = replace(mesh, vertices=vertices)
+    corners = _open_corners(mesh, plane)
+    if not len(corners):
+        return mesh
+    # The vertices of the border go into the boundary edges that they lie next to.
+    points = np.unique(border.reshape(-1, 3), axis=0)
+    ends = mesh.vertices[corners[:, :2]]
+    found = nearest_on_edges(points, ends)
+    to_ends_m = np.linalg.norm(points[:, None] - ends[found.edge], axis=2).min(axis=1)
+    inside = (found.distance_m <= reach_m) & (found.share > 0) & (found.share < 1)
+    inside &= to_ends_m > _SAME_M
+    # In a triangle with two boundary edges, only the first takes new vertices.
+    _, first = np.unique(corners[:, 3], return_index=True)
+    inside &= np.isin(found.edge, first)
+    chosen = np.flatnonzero(inside)
+    chosen = chosen[np.lexsort((found.share[chosen], found.edge[chosen]))]
+    new = (len(mesh.vertices) + np.arange(len(chosen))).astype(np.int32)
+    edges = corners[found.edge[chosen], :2].astype(np.int32)
+    grown = with_vertices(mesh, points[chosen], edges, found.share[chosen])
+    return replace(grown, faces=_split_faces(mesh.faces, corners, found.edge[chosen], new))
 
 
 def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
@@ -153,30 +167,6 @@ def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
     row = np.arange(len(points))
     edge = candidates[row, best].astype(np.int64)
     return OnEdges(edge, share[row, best], feet[row, best], distance_m[row, best])
-
-
-def _with_inserted(
-    mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
-) -> TriangleMesh:
-    """Insert the vertices of a border into the boundary edges that they lie next to."""
-    corners = _open_corners(mesh, plane)
-    if not len(corners):
-        return mesh
-    points = np.unique(border.reshape(-1, 3), axis=0)
-    ends = mesh.vertices[corners[:, :2]]
-    found = nearest_on_edges(points, ends)
-    to_ends_m = np.linalg.norm(points[:, None] - ends[found.edge], axis=2).min(axis=1)
-    inside = (found.distance_m <= reach_m) & (found.share > 0) & (found.share < 1)
-    inside &= to_ends_m > _SAME_M
-    # In a triangle with two boundary edges, only the first takes new vertices.
-    _, first = np.unique(corners[:, 3], return_index=True)
-    inside &= np.isin(found.edge, first)
-    chosen = np.flatnonzero(inside)
-    chosen = chosen[np.lexsort((found.share[chosen], found.edge[chosen]))]
-    new = (len(mesh.vertices) + np.arange(len(chosen))).astype(np.int32)
-    edges = corners[found.edge[chosen], :2].astype(np.int32)
-    grown = with_vertices(mesh, points[chosen], edges, found.share[chosen])
-    return replace(grown, faces=_split_faces(mesh.faces, corners, found.edge[chosen], new))
 
 
 def _split_faces(faces: Int32, corners: Int32, edge: Places, new: Int32) -> Int32:

@@ -83,7 +83,11 @@ def mesh_grid(cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings
     Ref: Evans, Kirkpatrick & Townsend, "Right-triangulated irregular networks", Algorithmica 2001.
     """
     cloud = usable(cloud.select(cloud.xyz[:, 2] > 0))
-    grid = _smoothed(_sorted(cloud, camera))
+    grid = _sorted(cloud, camera)
+    # Smoothed twice: disparities that are far off the first time hardly count the second.
+    first = _fit_planes(grid, np.ones(grid.point.shape))
+    off = (grid.disparity - first.disparity) / first.sigma
+    grid = _fit_planes(grid, np.asarray(1 / (1 + off**2)))
     edges = _edges(grid)
     pixels = _whole(_triangles(_errors(grid, edges)), grid, edges)
     place, faces = _manifold(pixels, settings.min_component_faces, grid.point.shape[1])
@@ -102,8 +106,9 @@ def _sorted(cloud: PointCloud, camera: RectifiedCamera) -> _Grid:
     """Sort the points of a cloud into their pixels, of which it may have every n-th."""
     z = cloud.xyz[:, 2].astype(np.float64)
     u, v = (camera.focal_px * cloud.xyz[:, k] / z for k in (0, 1))
-    column, first_u = _places(u + camera.cx_px)
-    row, first_v = _places(v + camera.cy_px)
+    column, row = (np.rint(k).astype(np.int64) for k in (u + camera.cx_px, v + camera.cy_px))
+    first_u, first_v = int(column.min()), int(row.min())
+    column, row = column - first_u, row - first_v
     step = max(1, int(np.gcd(np.gcd.reduce(column), np.gcd.reduce(row))))
     column, row = column // step, row // step
     # The grid is padded to whole squares.
@@ -118,20 +123,6 @@ def _sorted(cloud: PointCloud, camera: RectifiedCamera) -> _Grid:
     across, below = (step * np.arange(count, dtype=np.float64) for count in (width, height))
     across, below = across + (first_u - camera.cx_px), below + (first_v - camera.cy_px)
     return _Grid(point, disparity, sigma, flat, flat, across, below)
-
-
-def _places(coordinates: Float64) -> tuple[Int64, int]:
-    """The pixels of coordinates, counted from the first one."""
-    pixels = np.rint(coordinates).astype(np.int64)
-    first = int(pixels.min())
-    return pixels - first, first
-
-
-def _smoothed(grid: _Grid) -> _Grid:
-    """Smooth disparities twice: those that are far off the first time hardly count the second."""
-    first = _fit_planes(grid, np.ones(grid.point.shape))
-    off = (grid.disparity - first.disparity) / first.sigma
-    return _fit_planes(grid, np.asarray(1 / (1 + off**2)))
 
 
 def _fit_planes(grid: _Grid, trust: Float64) -> _Grid:
@@ -397,20 +388,16 @@ def closed_behind(mesh: TriangleMesh, thickness_m: float) -> TriangleMesh:
     front = _moved_apart(mesh.vertices, mesh.faces)
     back = front * (1 + thickness_m / front[:, 2:].astype(np.float64))
     vertices = np.concatenate([front, back]).astype(np.float32)
-    behind, edges = mesh.faces + len(front), _border(mesh.faces)
+    # The edges that one triangle alone has, in its direction.
+    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    ends = np.sort(edges, axis=1)
+    _, first, count = np.unique(ends, axis=0, return_index=True, return_counts=True)
+    behind, edges = mesh.faces + len(front), edges[first[count == 1]]
     (a, b), (c, d) = edges.T, edges.T + len(front)
     walls = np.concatenate([np.stack([b, a, c], axis=1), np.stack([b, c, d], axis=1)])
     faces = np.concatenate([mesh.faces, behind[:, ::-1], walls]).astype(np.int32)
     rgb = None if mesh.rgb is None else np.concatenate([mesh.rgb, mesh.rgb])
     return TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)
-
-
-def _border(faces: Int32) -> Int32:
-    """Return the edges (E, 2) that one triangle alone has, in its direction."""
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    ends = np.sort(edges, axis=1)
-    _, first, count = np.unique(ends, axis=0, return_index=True, return_counts=True)
-    return np.asarray(edges[first[count == 1]])
 
 
 def _moved_apart(vertices: Float32, faces: Int32) -> Float32:

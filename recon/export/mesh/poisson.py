@@ -119,7 +119,13 @@ def reconstruct_mesh(
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
     cloud = oriented(cloud, viewpoint_m)
-    depth = settings.depth or _fitting_depth(cloud.xyz, settings)
+    depth = settings.depth
+    if depth is None:  # the smallest whose cells are no wider than the settings allow
+        cell_m = settings.cell_spacings * typical_spacing_m(cloud.xyz)
+        extent_m = float(np.ptp(cloud.xyz, axis=0).max()) * _OCTREE_SCALE
+        depth = settings.max_depth
+        if cell_m * 2**depth > extent_m:
+            depth = int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, depth))
     normals = np.asarray(cloud.normals)
     vertices, faces, density = screened_poisson(
         cloud.xyz, normals, depth, _OCTREE_SCALE, settings.point_weight
@@ -170,7 +176,13 @@ def usable(cloud: PointCloud) -> PointCloud:
         expected = f"at least {_MIN_POINTS} finite points"
         raise MeshingError("too few points for a surface", got=int(finite.sum()), expected=expected)
     cloud = cloud.select(finite)
-    _refuse_outliers(cloud.xyz)
+    # An octree would have the points of a cloud in one cell whose box is much wider.
+    away_m = np.linalg.norm(cloud.xyz.astype(np.float64) - np.median(cloud.xyz, axis=0), axis=1)
+    half_m, farthest_m = float(np.median(away_m)), float(away_m.max())
+    if farthest_m > _FARTHEST * half_m > 0:
+        half = f"of which half of the points are within {half_m:.3g} m"
+        got, hint = f"{farthest_m:.3g} m from the middle, {half}", "remove outliers from the cloud"
+        raise MeshingError("a point lies far from all others", got=got, hint=hint)
     centred = cloud.xyz.astype(np.float64) - cloud.xyz.mean(axis=0, dtype=np.float64)
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred)), 0))
     # float32 coordinates resolve about 1e-5 of the extent.
@@ -181,16 +193,6 @@ def usable(cloud: PointCloud) -> PointCloud:
         hint = "subtract an offset from all coordinates" if distant else None
         raise MeshingError("all points lie in one place or on one line", got=got, hint=hint)
     return cloud
-
-
-def _refuse_outliers(xyz: Float32) -> None:
-    """Refuse a cloud whose box is so wide that an octree would have its points in one cell."""
-    away_m = np.linalg.norm(xyz.astype(np.float64) - np.median(xyz, axis=0), axis=1)
-    half_m, farthest_m = float(np.median(away_m)), float(away_m.max())
-    if farthest_m > _FARTHEST * half_m > 0:
-        half = f"of which half of the points are within {half_m:.3g} m"
-        got, hint = f"{farthest_m:.3g} m from the middle, {half}", "remove outliers from the cloud"
-        raise MeshingError("a point lies far from all others", got=got, hint=hint)
 
 
 def oriented(cloud: PointCloud, viewpoint_m: Point | None = None) -> PointCloud:
@@ -208,15 +210,6 @@ def oriented(cloud: PointCloud, viewpoint_m: Point | None = None) -> PointCloud:
         away = np.einsum("ij,ij->i", normals, np.asarray(viewpoint_m) - cloud.xyz) < 0
         normals = np.where(away[:, None], -normals, normals)
     return replace(cloud, normals=normals)
-
-
-def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
-    """Return the smallest octree depth whose cells are no wider than the settings allow."""
-    cell_m = settings.cell_spacings * typical_spacing_m(xyz)
-    extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
-    if cell_m * 2**settings.max_depth <= extent_m:
-        return settings.max_depth
-    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, settings.max_depth))
 
 
 def typical_spacing_m(xyz: Float32) -> float:

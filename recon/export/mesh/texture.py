@@ -303,7 +303,9 @@ class _Canvas:
         """Add colours of texels times the weights (V,) of vertices, interpolated."""
         faces, known = self._atlas.mesh.faces, weight > _NOTHING
         rows = np.flatnonzero(reduce(np.logical_or, (known[corner] for corner in faces.T)))
-        texels = _ranges(self._begin[rows], self._begin[rows + 1])
+        begin = self._begin[rows]
+        size = self._begin[rows + 1] - begin
+        texels = np.repeat(begin - np.cumsum(size) + size, size) + np.arange(size.sum())
         if not len(texels):
             return
         for part in np.array_split(texels, 1 + len(texels) // _AT_ONCE):
@@ -336,9 +338,3 @@ def _seen_by(view: PosedImage, gain: float, vertices: Float32, at: _Texels) -> F
         view.image, where[0], where[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     return np.asarray(gain * found.reshape(-1, 3)[: len(u)], np.float32)
-
-
-def _ranges(begin: Int64, end: Int64) -> Int64:
-    """Return the numbers from each begin (N,) to before its end, one after the other."""
-    size = end - begin
-    return np.repeat(begin - np.cumsum(size) + size, size) + np.arange(size.sum())

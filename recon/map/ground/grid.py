@@ -19,7 +19,7 @@ from pydantic import Field
 from recon.core.errors import MappingError
 from recon.core.settings import Settings
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, OccupancyVoxels
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, freeze
+from recon.core.values.arrays import Bool, Float64, Int32, Int64, freeze
 from recon.core.values.grid import log_odds
 from recon.map.ground.surface import WINDOW_M, GroundSurface
 
@@ -65,7 +65,11 @@ def flatten(
     those of the wall. It is not free if it lies beside an obstacle and was hit as low as it is
     free. Everything else, and every cell without a known ground, is unknown.
     """
-    _check(voxels, settings)
+    if len(voxels) == 0:
+        raise MappingError("nothing was observed: there is no map to flatten")
+    if settings.max_height_m <= settings.min_height_m:
+        band = f"{settings.min_height_m:g} to {settings.max_height_m:g} m"
+        raise MappingError("the height band of the grid is empty", got=band)
     low, (rows, columns), cell = _columns(voxels)
     height = _heights(voxels, ground)
 
@@ -78,28 +82,23 @@ def flatten(
     full = voxels.log_odds >= log_odds(OCCUPIED_PROBABILITY)
     empty = voxels.log_odds <= log_odds(FREE_PROBABILITY)
     solid = number_in(hit & full)
-    blocked = _without_small_blobs(solid > 0, s.min_blob_cells)
+    blocked = solid > 0
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(
+        blocked.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S
+    )
+    blocked &= (stats[:, cv2.CC_STAT_AREA] >= s.min_blob_cells)[labels]
     hit_low = number_in(hit & low_air) > 0
     free = (number_in(empty & low_air) > 0) & ~blocked & ~(hit_low & _beside(blocked))
     seen = number_in(empty & (height >= 0)) > 0
     unsure = (number_in(hit) > 0) & seen & ~blocked & ~free & ~_beside(free)
-    blocked &= solid >= SMEAR_SHARE * _largest_around(solid)
+    window = np.ones((2 * JOINED_CELLS + 1, 2 * JOINED_CELLS + 1), np.uint8)
+    blocked &= solid >= SMEAR_SHARE * cv2.dilate(solid.astype(np.float32), window)
     for _ in range(JOINED_CELLS):
         blocked |= unsure & _beside(blocked)
     cells = np.where(free, np.int8(FREE), np.int8(UNKNOWN))
     cells[blocked] = OCCUPIED
     origin = (float(low[0]) * voxels.resolution_m, float(low[1]) * voxels.resolution_m)
     return OccupancyGrid(cells, voxels.resolution_m, origin)
-
-
-def _check(voxels: OccupancyVoxels, settings: GridSettings) -> None:
-    if len(voxels) == 0:
-        raise MappingError("nothing was observed: there is no map to flatten")
-    if settings.max_height_m <= settings.min_height_m:
-        raise MappingError(
-            "the height band of the grid is empty",
-            got=f"{settings.min_height_m:g} to {settings.max_height_m:g} m",
-        )
 
 
 def ground_depths(voxels: OccupancyVoxels, ground: GroundSurface) -> Float64:
@@ -149,21 +148,6 @@ def _beside(cells: Bool) -> Bool:
     """Return the cells of a mask, and those that share a side with one."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return np.asarray(cv2.dilate(cells.astype(np.uint8), cross) > 0)
-
-
-def _largest_around(numbers: Int64) -> Float32:
-    """Return the largest number within `JOINED_CELLS` of each cell."""
-    window = np.ones((2 * JOINED_CELLS + 1, 2 * JOINED_CELLS + 1), np.uint8)
-    return np.asarray(cv2.dilate(numbers.astype(np.float32), window))
-
-
-def _without_small_blobs(blocked: Bool, least: int) -> Bool:
-    """Return the mask without connected blobs (8 neighbours) of fewer than ``least`` cells."""
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(
-        blocked.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S
-    )
-    large = stats[:, cv2.CC_STAT_AREA] >= least
-    return np.asarray(blocked & large[labels])
 
 
 _SAME_M: Final = 0.3

@@ -21,7 +21,7 @@ from recon.core.errors import MappingError
 from recon.core.kernels.voxels import find_keys, pack_keys
 from recon.core.settings import Length, Settings
 from recon.core.values import OccupancyVoxels, PointCloud
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, freeze
+from recon.core.values.arrays import Bool, Float32, Float64, Int64, freeze
 from recon.core.values.grid import log_odds
 
 _BIN_M: Final = 0.05
@@ -35,6 +35,7 @@ the next."""
 MAX_TILT_DEG: Final = 35.0  # points with normals tilted more are no ground
 MIN_POINTS: Final = 3  # points that make a measured cell
 _MAX_GAP_M: Final = 4.0  # how far a height is carried over cells without points
+_BEYOND: Final = np.iinfo(np.int32).max  # ring of the cells that are out of reach
 
 
 class GroundSettings(Settings):
@@ -150,7 +151,10 @@ class _Field:
     def __init__(self, cloud: PointCloud, path: Float64, settings: GroundSettings) -> None:
         self.cell_m = cell = max(CELL_M, settings.reach_m / _MOST_RINGS)
         rings = math.ceil(settings.reach_m / cell)
-        path = np.concatenate([_densify(piece, cell / 2) for piece in _pieces(path)])
+        known = np.isfinite(path).all(axis=1)
+        pieces = np.split(path, np.flatnonzero(np.diff(known)) + 1)
+        known_pieces = [one for one in pieces if len(one) and np.isfinite(one[0]).all()]
+        path = np.concatenate([_densify(piece, cell / 2) for piece in known_pieces])
         low = np.floor(path[:, :2].min(axis=0) / cell) - rings
         columns, rows = (np.floor(path[:, :2].max(axis=0) / cell) - low + rings + 1).astype(int)
         self.origin = (float(low[0] * cell), float(low[1] * cell))
@@ -158,7 +162,10 @@ class _Field:
         self.measured = np.zeros((rows, columns), dtype=np.bool_)
         self._gap = np.full((rows, columns), np.inf)
         self._path_z = self._path_height(path)
-        self._ring = _rings(np.isfinite(self._path_z), rings)
+        # Steps, to 8 neighbours, from the nearest cell below the path.
+        away = np.where(np.isfinite(self._path_z), 0, 255).astype(np.uint8)
+        steps = np.rint(cv2.distanceTransform(away, cv2.DIST_C, 3)).astype(np.int32)
+        self._ring = np.where(steps <= rings, steps, _BEYOND).astype(np.int32)
         self._cell, self._z = self._points(cloud)
 
     def camera_height(self) -> float:
@@ -193,7 +200,7 @@ class _Field:
         """Fill ring after ring, from the path outward."""
         ring_of_point = self._ring.ravel()[self._cell]
         order = np.argsort(ring_of_point, kind="stable")
-        last = int(self._ring[self._ring < np.iinfo(np.int32).max].max())
+        last = int(self._ring[self._ring < _BEYOND].max())
         bounds = np.searchsorted(ring_of_point[order], np.arange(last + 2))
         for ring in range(last + 1):
             cells = np.flatnonzero(self._ring.ravel() == ring)
@@ -252,7 +259,7 @@ class _Field:
             xyz = xyz[cloud.normals[:, 2] >= upright]
         cells, inside = self._cells_of(xyz)
         cells, z = cells[inside], xyz[inside, 2]
-        reached = self._ring.ravel()[cells] < np.iinfo(np.int32).max
+        reached = self._ring.ravel()[cells] < _BEYOND
         return cells[reached], z[reached]
 
     def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], Bool]:
@@ -264,13 +271,6 @@ class _Field:
         return row * columns + column, np.asarray(inside)
 
 
-def _pieces(path: Float64) -> list[Float64]:
-    """Return the runs of rows between those of NaN."""
-    known = np.isfinite(path).all(axis=1)
-    runs = np.split(path, np.flatnonzero(np.diff(known)) + 1)
-    return [run for run in runs if len(run) and np.isfinite(run[0]).all()]
-
-
 def _densify(path: Float64, step_m: float) -> Float64:
     """Return the path with points at most ``step_m`` apart."""
     if len(path) == 1:
@@ -279,13 +279,6 @@ def _densify(path: Float64, step_m: float) -> Float64:
     along = np.concatenate([[0.0], np.cumsum(pieces)])
     wanted = np.linspace(0.0, along[-1], max(2, math.ceil(along[-1] / step_m) + 1))
     return np.stack([np.interp(wanted, along, path[:, axis]) for axis in range(3)], axis=1)
-
-
-def _rings(seeds: Bool, reach: int) -> Int32:
-    """Return steps (to 8 neighbours) from the nearest seed; the largest int32 beyond ``reach``."""
-    away = np.where(seeds, 0, 255).astype(np.uint8)
-    steps = np.rint(cv2.distanceTransform(away, cv2.DIST_C, 3)).astype(np.int32)
-    return np.where(steps <= reach, steps, np.iinfo(np.int32).max).astype(np.int32)
 
 
 def _smooth(heights: Float64, measured: Bool) -> Float64:

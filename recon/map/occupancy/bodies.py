@@ -76,13 +76,20 @@ def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
     each frame saw in the cells, int8 (N,): 1 hit, -1 looked through, 0 neither.
     """
     pairs, upright = pairs_of(keys)
-    seen = _count(len(keys), pairs, looks)
+    of_cells, before = np.zeros((3, len(keys)), np.int64), np.zeros(len(keys), np.int8)
+    of_pairs = np.zeros((2, len(pairs)), np.int64)
+    for look in looks:
+        count_look(look, before, of_cells, pairs, of_pairs)
+    seen = _Seen(*of_cells, *of_pairs)
     piece = pieces_of(len(keys), pairs)
     ratio = _disagreement(seen, pairs, upright, placed, piece)[piece]
     known = np.isfinite(ratio)
     body = known & (ratio <= _DISAGREEMENT)
     for _ in range(_GAPS):
-        body |= ~known & _near(keys, body)
+        near, among = np.zeros(len(keys), np.bool_), keys[body]
+        for stride in _WITHIN_GAP:
+            near |= find_keys(keys + stride, among)[1]
+        body |= ~known & near
     # A few cells alone: hit in one run of frames, and looked through before or after.
     alone = (seen.runs == 1) & (seen.through >= _LEAST_LOOKS)
     return np.asarray(body | (~known & alone))
@@ -97,14 +104,6 @@ def pairs_of(keys: Int64) -> tuple[Int64, Bool]:
         found.append(np.stack([rows, place[rows]], axis=1))
         upright.append(np.full(len(rows), not step[:2].any()))
     return np.concatenate(found), np.concatenate(upright)
-
-
-def _count(cells: int, pairs: Int64, looks: Iterable[Int8]) -> _Seen:
-    of_cells, before = np.zeros((3, cells), np.int64), np.zeros(cells, np.int8)
-    of_pairs = np.zeros((2, len(pairs)), np.int64)
-    for look in looks:
-        count_look(look, before, of_cells, pairs, of_pairs)
-    return _Seen(*of_cells, *of_pairs)
 
 
 def _disagreement(seen: _Seen, pairs: Int64, upright: Bool, placed: Bool, piece: Int64) -> Float64:
@@ -144,20 +143,12 @@ def pieces_of(cells: int, pairs: Int64) -> Int64:
         label = least
 
 
-def _near(keys: Int64, body: Bool) -> Bool:
-    """Return bool (N,), cells with one of a body within the gap."""
-    steps = np.array(list(product(range(-_GAP_CELLS, _GAP_CELLS + 1), repeat=3)))
-    near, among = np.zeros(len(keys), np.bool_), keys[body]
-    for stride in strides(steps):
-        near |= find_keys(keys + stride, among)[1]
-    return near
-
-
 def strides(steps: Int64) -> Int64:
     """Return by how much packed cells differ that are some steps (N, 3) apart."""
     return pack_keys(steps) - pack_keys(np.zeros((1, 3), np.int64))
 
 
+_WITHIN_GAP: Final = strides(np.array([*product(range(-_GAP_CELLS, _GAP_CELLS + 1), repeat=3)]))
 _KEPT_FRAMES: Final = 192
 """Frames whose rays stay in memory, some 0.3 MB each: a tile needs those near it more than once."""
 

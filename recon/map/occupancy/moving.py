@@ -115,7 +115,11 @@ def find_moved(
         moved[moved], by_error = body, reaches.cells[body]
         for sigmas in _SIGMAS:
             rows = np.flatnonzero(moved)
-            stays = _is_beside(keys[rows], sigmas * by_error, occupied)
+            # Bodies of which at least half has a surface in its reach.
+            others = np.sort(occupied[~are_among(occupied, keys[rows])])
+            beside = still_there(keys[rows], sigmas * by_error, others)
+            piece = pieces_of(len(rows), pairs_of(keys[rows])[0])
+            stays = (np.bincount(piece, beside - 0.5) >= 0)[piece]
             moved[rows[stays]], by_error = False, by_error[~stays]
             if moved[home[counted]].sum() <= _MUCH * counted.sum():
                 break
@@ -145,13 +149,6 @@ def _left_below(points: Float64, packed: Int64, moved: Bool, finest: Looks) -> B
     return found
 
 
-def _is_beside(keys: Int64, reach: Float64, occupied: Int64) -> Bool:
-    """Return bool (N,), cells of bodies of which at least half has a surface in its reach."""
-    beside = still_there(keys, reach, np.sort(occupied[~are_among(occupied, keys)]))
-    piece = pieces_of(len(keys), pairs_of(keys)[0])
-    return np.asarray((np.bincount(piece, beside - 0.5) >= 0)[piece])
-
-
 def _among(home: Int64, points: Bool) -> Bool:
     """Return bool (cells,), which cells have one of the points; ``home`` is the cell of each."""
     found = np.zeros(int(home.max(initial=-1)) + 1, np.bool_)
@@ -173,7 +170,14 @@ def _mostly_free(
     # What was there when the drive ended, and is free in the end, another drive looked through:
     # a later one; or an earlier one, where this one hit it hardly more often than by chance.
     seen[free_in_the_end & (seen > _FREE)] = -_MOST
-    mean = _mean_around(keys, keys[tells], seen[tells])
+    # Of those that touch each one; NaN where there are none.
+    total, number = np.zeros((2, len(keys)), np.float32)
+    among, values = keys[tells], seen[tells]
+    for stride in strides(_AROUND):
+        place, known = find_keys(keys + stride, among)
+        total[known] += values[place[known]]
+        number += known
+    mean = np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
     return _grown(keys, mean <= 0, mean <= _UNSURE), np.asarray(seen <= 0)
 
 
@@ -197,16 +201,6 @@ def _touching(wanted: Int64, keys: Int64, steps: Int64) -> Int64:
     return number
 
 
-def _mean_around(wanted: Int64, keys: Int64, values: Float32) -> Float32:
-    """Return float32 (N,), mean value of the sorted keys that touch each wanted one, or NaN."""
-    total, number = np.zeros((2, len(wanted)), np.float32)
-    for stride in strides(_AROUND):
-        place, known = find_keys(wanted + stride, keys)
-        total[known] += values[place[known]]
-        number += known
-    return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
-
-
 def _in_reach(places: Float64, reach: Float32, keys: Int64) -> Bool:
     """Return bool (N,): places with one of the adjacent sorted keys in reach; in cells."""
     cells = np.floor(places).astype(np.int64)
@@ -218,9 +212,6 @@ def _in_reach(places: Float64, reach: Float32, keys: Int64) -> Bool:
     return near
 
 
-_EVEN: Final = np.float32(0)
-
-
 def looked_through(points: Float32, voxels: OccupancyVoxels) -> Bool:
     """Return bool (N,), points (N, 3) whose voxel is free, with no occupied one that touches it.
 
@@ -229,7 +220,7 @@ def looked_through(points: Float32, voxels: OccupancyVoxels) -> Bool:
     """
     cells = np.floor(points / np.float32(voxels.resolution_m)).astype(np.int64)
     keys = pack_keys(voxels.keys)
-    _, through = find_keys(pack_keys(cells), np.sort(keys[voxels.log_odds <= _EVEN]))
+    _, through = find_keys(pack_keys(cells), np.sort(keys[voxels.log_odds <= 0]))
     occupied = np.sort(keys[voxels.log_odds > 0])
     rows = np.flatnonzero(through)
     for step in product((-1, 0, 1), repeat=3):
