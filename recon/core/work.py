@@ -26,10 +26,7 @@ FEW: Final = min(2, available_cores())
 
 
 def use_threads(threads: int | None) -> int:
-    """Limit OpenCV to ``threads`` (None = all cores) and return the number in use.
-
-    More threads than cores would only take memory.
-    """
+    """Limit OpenCV to ``threads`` (None = all cores, the most there are); return how many."""
     count = min(threads or available_cores(), available_cores())
     cv2.setNumThreads(count)
     return count

@@ -174,10 +174,7 @@ def _ground_of(placed: PlacedMap) -> AreGround:
 
 
 def ground_points(cloud: PointCloud, surface: GroundSurface) -> Bool:
-    """Return bool (N,), which points lie on a surface and, if normals are known, face up.
-
-    Nothing but ground lies below it: as far as that is seen too low, it is seen too high elsewhere.
-    """
+    """Return bool (N,), which points lie on a surface and, if normals are known, face up."""
     above_m = cloud.xyz[:, 2] - surface.height_at(cloud.xyz[:, :2])
     below_m = -above_m[(above_m <= 0) & (above_m >= -WINDOW_M)]
     thick_m = float(np.quantile(below_m, GROUND_SHARE)) if len(below_m) else 0.0

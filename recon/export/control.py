@@ -155,10 +155,7 @@ class _Images:
 
 
 def _located(sightings: Sequence[_Sighting]) -> tuple[Float64, Float64] | None:
-    """Return a point (3,), map axes, and its covariance; None without depth.
-
-    By least squares over columns, rows and disparities, as uncertain as they are.
-    """
+    """Return a point (3,), map axes, by least squares, and its covariance; None without depth."""
     deep = [one for one in sightings if np.isfinite(one.uvd[2])]
     if not deep:
         return None
@@ -179,10 +176,7 @@ def _located(sightings: Sequence[_Sighting]) -> tuple[Float64, Float64] | None:
 
 
 def _fitted(ours_m: Float64, place_m: Float64, spread: Float64) -> Float64:
-    """Return T_survey_map, rigid, by points with covariances (N, 3, 3) in map axes.
-
-    That the map is level is known to a few degrees.
-    """
+    """Return T_survey_map, nearly level, by points with covariances (N, 3, 3) in map axes."""
     start = fit_upright(ours_m, place_m).T_to_from
     middle_m = ours_m.mean(axis=0)
 

@@ -138,10 +138,7 @@ class _Drive:
 
 
 def _variance(session: Session) -> Float64:
-    """Return (N, 2), variances of positions and rotations since the beginning of each stretch.
-
-    They are what odometry states, and what it usually drifts; loops that were closed make less.
-    """
+    """Return (N, 2), variances of positions and rotations since the beginning of each segment."""
     path = DrivePath.of(session.odometry, session.health, session.scale)
     begins = np.searchsorted(np.maximum.accumulate(path.stretch), path.stretch)
     drift = np.stack(spread_over(path.path_m - path.path_m[begins], path.scale), axis=1)

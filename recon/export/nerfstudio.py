@@ -36,10 +36,7 @@ _POINTS: Final = "sparse_pc.ply"
 
 
 def nerfstudio_product(order: Order, folder: Path) -> Made:
-    """Write a folder with ``transforms.json`` and what it names, in map axes.
-
-    Frames are left images; all are matched again, as they were mapped, for their depth.
-    """
+    """Write ``transforms.json`` and what it names, map axes; depth is matched again."""
     drives, moved = order.drives, _moved_cells(order.placed.tiles)
     whole = all(drive.rectifier.valid is None or drive.rectifier.valid.all() for drive in drives)
     # All frames have a mask, or none: readers count them.

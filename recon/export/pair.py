@@ -34,12 +34,7 @@ _PHOTO: Final = "left.png"  # the left image, beside the mesh
 def mesh_frame(
     frame: ReconstructedFrame, settings: MeshSettings
 ) -> tuple[TriangleMesh | None, float | None, tuple[str, ...]]:
-    """Mesh the cloud of a frame as its camera saw it.
-
-    Returns:
-        The surface in camera axes, or None; the share of the measured points that lie on it;
-        warnings.
-    """
+    """Mesh a frame: surface in camera axes or None, fraction of measured points on it, warnings."""
     try:
         mesh = _surface(frame.cloud, frame.pair.camera, settings, frame.pair.colours)
         coverage = _coverage(mesh, frame.cloud, settings)
@@ -167,10 +162,7 @@ _COVERAGE_SAMPLES: Final = 100_000
 
 
 def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
-    """Return the share of the points of a pair that are covered by its mesh, from 0 to 1.
-
-    Of more than 100,000 points, every n-th is used.
-    """
+    """Return the fraction of points, of at most 100,000, that the mesh of a pair covers."""
     xyz = cloud.xyz[:: math.ceil(len(cloud) / _COVERAGE_SAMPLES)]
     distance_m = RayScene(mesh.vertices[mesh.faces]).distance(xyz)
     return float(np.mean(distance_m <= COVERED_WITHIN * xyz[:, 2]))

@@ -31,10 +31,9 @@ _MAX_SIGMA: Final = 6.0  # in voxels: less precise points are left out, they wou
 
 
 class CloudBuilder:
-    """Fuses clouds frame by frame.
+    """Fuses clouds frame by frame; a point weighs ``confidence / sigma²``.
 
-    A point weighs ``confidence / sigma²``. Time per frame grows with its points alone, memory with
-    the number of voxels. The same clouds in the same order give the same map.
+    Time per frame grows with its points alone, memory with the number of voxels.
     """
 
     def __init__(self, settings: FusionSettings) -> None:
@@ -44,7 +43,7 @@ class CloudBuilder:
         self._frames = 0
 
     def __len__(self) -> int:
-        """Return the number of voxels seen by at least one frame."""
+        """Return the number of voxels."""
         return int(self._sums.used[0])
 
     def integrate(self, cloud: PointCloud) -> None:

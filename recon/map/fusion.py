@@ -40,10 +40,7 @@ class FusionSettings(Settings):
 
 
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
-    """Return the depth at which 0.3 px, ``Z²·error_px / (f·b)``, cost ``max_depth_error_m``.
-
-    Infinity where the settings have no limit.
-    """
+    """Return the depth at which 0.3 px are ``max_depth_error_m``: ``Z²·error_px / (f·b)``."""
     if settings.max_depth_error_m is None:
         return math.inf
     fb = camera.focal_px * camera.baseline_m

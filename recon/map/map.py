@@ -31,10 +31,7 @@ from recon.map.tiles import Tiles
 
 
 class Map(MapFile):
-    """One or several drives on disk: open a map with `open`, then merge, cut or search it.
-
-    Begin one with `create` or `temporary`; `MapFile` has what is in it.
-    """
+    """One or several drives on disk, to be merged, cut or searched; `MapFile` has what is in it."""
 
     _cut: tuple[object, Tiles] | None = None
 
@@ -143,11 +140,7 @@ class MapPlaces:
 
 
 def look_up(tiles: Tiles, xyz: ArrayLike) -> MapPlaces:
-    """Return what a map in tiles knows of places (3,) or (N, 3), map axes.
-
-    Raises:
-        ShapeError: They are no such numbers, or not finite.
-    """
+    """Return what a map in tiles knows of places (3,) or (N, 3), map axes; or `ShapeError`."""
     places = _checked(xyz)
     cells = np.floor(places / tiles.resolution_m)
     known = np.flatnonzero((np.abs(cells) < KEY_LIMIT).all(axis=1))

@@ -125,10 +125,7 @@ def step_jacobian(xyz: NDArray[Any]) -> Float64:
 
 
 def adjoint(T_a_b: NDArray[Any]) -> Float64:
-    """Return the matrix that turns a step in the axes of b into the same motion in a's.
-
-    (6, 6) of a transform (4, 4), (…, 6, 6) of a stack.
-    """
+    """Return (…, 6, 6) that turns a step in the axes of b into the same motion in a's."""
     R, t = T_a_b[..., :3, :3], T_a_b[..., :3, 3]
     matrix = np.zeros((*T_a_b.shape[:-2], 6, 6))
     matrix[..., :3, :3] = matrix[..., 3:, 3:] = R

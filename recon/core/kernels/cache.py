@@ -54,8 +54,7 @@ def note_compiling() -> None:
 def cache_parent() -> Path:
     """The folder of the cache: ``NUMBA_CACHE_DIR``, else beside the sources, else in home.
 
-    Where the sources cannot be written, as in a system-wide installation, it is the user's cache
-    folder; a user without one, as in a container, gets a folder for temporary files.
+    A user without a home, as in a container, gets a folder for temporary files.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:

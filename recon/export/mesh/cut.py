@@ -59,10 +59,7 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
 
 
 def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, share: Float64) -> TriangleMesh:
-    """Add vertices (N, 3), which no face uses yet, on edges (N, 2), at shares from 0 to 1 of them.
-
-    Normals and colours are interpolated along the edges.
-    """
+    """Add vertices (N, 3) at shares of edges (N, 2); normals and colours are interpolated."""
     normals, rgb = mesh.normals, mesh.rgb
     if normals is not None:
         mixed = between(normals, edges, share)
@@ -211,10 +208,7 @@ def drop_small_components(vertices: Float32, faces: Int32, min_faces: int) -> tu
 
 
 def component_labels(faces: Int32) -> tuple[Int32, Int32]:
-    """Return int32 (F,), the component of each face, joined by edges, and int32 (C,), their sizes.
-
-    They are numbered by their first faces.
-    """
+    """Return int32 (F,), component of each face, in order of first faces; their sizes (C,)."""
     labels = components(meeting_sides(faces) // 3, len(faces))
     return labels, np.bincount(labels).astype(np.int32)
 

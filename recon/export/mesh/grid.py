@@ -288,10 +288,7 @@ def _corners(size: int) -> list[tuple[slice, slice]]:
 
 
 def _falling(shape: tuple[int, ...]) -> Bool:
-    """Which squares are cut from the upper left to the lower right; the others the other way.
-
-    Squares of half the size are cut towards the middle of those that they are parts of.
-    """
+    """Return which squares are cut from upper left to lower right; others the other way."""
     row, column = np.indices(shape)
     return np.asarray((row + column) % 2 == 0)
 

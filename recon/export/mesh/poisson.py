@@ -104,17 +104,15 @@ def reconstruct_mesh(
     Args:
         cloud: Points, with normals if possible; vertices take their colours.
         settings: Settings of the reconstruction.
-        viewpoint_m: The position that the points were seen from, in the frame of the cloud; used
-            only if the cloud has no normals. None = normals are only made consistent, and may
-            all be flipped.
+        viewpoint_m: Where the points were seen from, if they have no normals; None = they are only
+            made consistent, and may all be flipped.
         wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
 
     Returns:
         The mesh, with outward unit normals, and colours if the cloud has any.
 
     Raises:
-        MeshingError: The points are too few, coincident or collinear; Poisson failed; or
-            trimming left no face.
+        MeshingError: The points are too few, coincident or collinear, or no face is left.
 
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
@@ -142,10 +140,7 @@ def trimmed(
     settings: MeshSettings,
     wrong: Callable[[Float32], Bool] | None,
 ) -> TriangleMesh:
-    """Return vertices (V, 3) and faces (F, 3) without those that cannot be, and without crumbs.
-
-    Vertices take the colours of the nearest points of the cloud.
-    """
+    """Return the part of a surface that can be, without crumbs, in the colours of a cloud."""
     vertices, faces = surface
     if wrong is not None:
         vertices, faces = keep_vertices(vertices, faces, ~wrong(vertices))
@@ -244,20 +239,10 @@ def reconstruct_map_surface(
     voxel_m: float,
     wrong: Callable[[Float32], Bool] | None = None,
 ) -> TriangleMesh:
-    """Return the surface that the points of a map lie on.
+    """Return the surface that the points of a map with voxels of ``voxel_m`` lie on.
 
     Cells are as wide as its voxels, or two, four … times where points are that far apart. They
-    have the same places in all parts of a map, so that these meet.
-
-    Args:
-        cloud: Points, with normals to the side that is free if possible; vertices take their
-            colours.
-        settings: Settings of the mesh.
-        voxel_m: Edge of a voxel of the map.
-        wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
-
-    Raises:
-        MeshingError: The points are too few, coincident or collinear, or no face was left.
+    have the same places in all parts of a map, so that these meet. Otherwise as `reconstruct_mesh`.
     """
     cloud = oriented(cloud)
     apart = _OF_SEVENTH * typical_spacing_m(cloud.xyz) / voxel_m

@@ -260,10 +260,7 @@ def _insert(values: NDArray[Any], rows: Int64, place: Int64, new: Any) -> None:
 
 
 def paint(atlas: Atlas, best: BestViews, gains: Float64, views: Iterable[PosedImage]) -> UInt8:
-    """Return the picture (H, W, 3) of an atlas, painted by the images that its vertices chose.
-
-    What no image sees has the colours of the vertices.
-    """
+    """Return the picture (H, W, 3) of an atlas; what no image sees has the colours of vertices."""
     canvas = _Canvas(atlas)
     frames, weights = best.frames[atlas.vertex_of], best.weights(gains)[atlas.vertex_of]
     if atlas.mesh.rgb is not None:

@@ -77,10 +77,7 @@ class Drive:
         self._save()
 
     def frames(self, tracks: LiveTracks | None = None) -> Generator[FrameResult]:
-        """Yield the pose of each frame that is left, which becomes part of the map.
-
-        Of a drive that arrives, ``tracks`` keep what shows its rig.
-        """
+        """Yield the pose of each frame left; ``tracks`` keep what a live drive shows of its rig."""
         if self.source.live:
             return poses_first(
                 self.source, self.reconstructor, self.mapper.register, self._map_behind, tracks
@@ -215,7 +212,7 @@ def poses_first(
     map_frame: MapFrame,
     tracks: LiveTracks | None = None,
 ) -> Generator[FrameResult]:
-    """Yield the pose of each frame as soon as it is known, by odometry on rough disparities.
+    """Yield each pose as soon as it is known, by odometry on rough disparities.
 
     ``map_frame`` is called in another thread, in order; ``tracks`` keep what shows the rig.
     """
@@ -345,13 +342,7 @@ def resuming(where: str | Path) -> Iterator[None]:
 def session_info(
     source: StereoSource, config: DriveSettings, start: Mapping[str, Any] | None = None
 ) -> SessionInfo:
-    """Return what a session is a drive of.
-
-    Args:
-        source: The source.
-        config: The settings.
-        start: What a run is started with, to resume it.
-    """
+    """Return what a session is a drive of; ``start`` is what a run is begun with, to resume it."""
     return SessionInfo(
         source.name,
         source.description,

@@ -112,10 +112,7 @@ def imu_of(
 def doubt_poses(
     known_poses: Trajectory, source: StereoSource, config: DriveSettings
 ) -> tuple[str, ...]:
-    """Return a line for the user if known poses contradict what the cameras see.
-
-    They are compared with the first motions, in camera axes and in those of a body.
-    """
+    """Return a line if known poses contradict the first motions that the cameras see."""
     poses = _of_frames(known_poses, source).T_world_camera
     by_number = Trajectory(poses, np.arange(len(poses), dtype=np.float64))
     if len(poses) < 2:

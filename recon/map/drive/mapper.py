@@ -173,10 +173,7 @@ _MAX_FRAMES: Final = 100
 
 
 class SubmapBuilder:
-    """Builds the submaps of a drive, one after the other.
-
-    At ``max_bytes`` a new submap begins; None = no limit.
-    """
+    """Builds the submaps of a drive, none of more than ``max_bytes`` (None = no limit)."""
 
     def __init__(
         self,

@@ -59,10 +59,7 @@ def scale_of(depth_m: float, sigma_m: float) -> float:
 def _depths(
     pairs: Iterable[Recorded], rig: Rig, settings: StereoSettings
 ) -> Iterator[tuple[float, float]]:
-    """Yield depth of the mean disparity of some frames, and its standard deviation, metres.
-
-    A frame that cannot be matched is left out: that is said when it is mapped.
-    """
+    """Yield depth (m) of the mean disparity of each frame that is matched; its deviation."""
     reconstructor = FrameReconstructor(rig, settings)
     camera = reconstructor.camera
     for pair in pairs:

@@ -71,10 +71,8 @@ class MappedSequence:
         map: The map, in which the drive is the only session.
         sample: The frame in the middle of the drive, for display.
         seconds: Wall-clock time from the first frame to the last.
-        loops: Result of loop closure; None = it was not run.
-        prior: How the external trajectory was used; None = there was none.
-        imu: What the drive shows of its inertial unit; None = it has none, or is not used.
-        sfm: What structure from motion found; None = it was not asked.
+        loops, prior, imu, sfm: What came of loop closure, of an external trajectory, of an inertial
+            unit, of structure from motion; None = they were not used.
         threads: Threads with which rays are cast.
         tracks: What a drive showed of its rig while it arrived; empty of any other.
     """

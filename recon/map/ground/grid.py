@@ -104,8 +104,7 @@ def flatten(
 def ground_depths(voxels: OccupancyVoxels, ground: GroundSurface) -> Float64:
     """Return how far occupied voxels of the ground lie below it; float64 (N,), metres.
 
-    Nothing but ground is there, and as far as it is seen too low, it is seen too high elsewhere: by
-    its roughness, by noise, and because a voxel stands for all within it.
+    As far as it is seen too low, it is seen too high elsewhere.
     """
     if len(voxels) == 0:
         return np.zeros(0)

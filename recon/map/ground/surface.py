@@ -69,10 +69,7 @@ class GroundSurface:
         freeze(self, "drops_m", np.float64, self.heights_m.shape)
 
     def height_at(self, xy: NDArray[Any]) -> Float64:
-        """Return the height of the ground at places (N, 2), bilinear between centres of cells.
-
-        NaN where the height of the cell of the place itself is unknown.
-        """
+        """Return heights at places (N, 2), bilinear; NaN where that of their cell is unknown."""
         place = (np.asarray(xy, dtype=np.float64) - self.origin_m) / self.cell_m
         column, row = place[:, 0], place[:, 1]
         own = self._cells(np.floor(row), np.floor(column))
@@ -297,10 +294,7 @@ _REACH: Final = 2
 
 
 def find_floors(voxels: OccupancyVoxels) -> Float32:
-    """Return float32 (N, 3), centres of the occupied voxels with free space right above them.
-
-    Walls have none. Voxels on another column do not matter, so tiles can be looked at alone.
-    """
+    """Return float32 (N, 3), centres of the occupied voxels with free space right above them."""
     packed = pack_keys(voxels.keys)
     order = np.argsort(packed)
     packed, log_odds = packed[order], voxels.log_odds[order]
@@ -315,10 +309,7 @@ def find_floors(voxels: OccupancyVoxels) -> Float32:
 
 
 def add_floors(cloud: PointCloud, floors: Float32) -> PointCloud:
-    """Return a cloud to look for ground in: its points, and floors (N, 3) where it has too few.
-
-    It has normals if the cloud has them, straight up for floors.
-    """
+    """Return a cloud to look for ground in: its points, and floors (N, 3) where it has too few."""
     known = cloud.xyz
     if cloud.normals is not None:
         known = known[cloud.normals[:, 2] >= math.cos(math.radians(MAX_TILT_DEG))]

@@ -118,10 +118,7 @@ def measure_relief(
 def _one_frame(
     cell: Int64, rays: Float64, height_m: Float64, sigma_m: Float64, blur_rad: float
 ) -> tuple[Int64, Float64]:
-    """Return cells, each once, and what is added to their sums (N, 8).
-
-    The errors of neighbouring points of a frame are alike, so all of a cell are one measurement.
-    """
+    """Return cells, each once, and what is added to their sums (N, 8)."""
     away, level = np.linalg.norm(rays, axis=1), np.linalg.norm(rays[:, :2], axis=1)
     sine = np.maximum(np.abs(rays[:, 2]) / away, _FLATTEST)
     along, across = np.hypot(sigma_m * level / away, blur_rad * away / sine), blur_rad * away

@@ -266,8 +266,7 @@ class FirstFix:
     ) -> Loop | None:
         """Return the best believed loop to the next frame, ``path_m`` into the drive, if any.
 
-        Behind one of the ``breaks`` of the odometry no frame before says where it is: several views
-        of the map are enough.
+        Behind a break of the odometry several views of the map are enough.
         """
         at = (T_odometry_camera, path_m, breaks)
         options = {"most": _ANYWHERE} if breaks and not hurried else {}

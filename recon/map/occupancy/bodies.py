@@ -171,10 +171,7 @@ class Looks:
         self._read = lru_cache(_KEPT_FRAMES)(rays)
 
     def at(self, keys: Int64) -> Iterator[Int8]:
-        """Yield what each frame near some packed cells saw in them, int8 (N,).
-
-        1 where it hit something, -1 where it looked through, 0 where it saw neither.
-        """
+        """Yield what each frame near packed cells saw (N,): 1 hit, -1 through, 0 neither."""
         return (look for _, look in self.by_frame(keys))
 
     def by_frame(self, keys: Int64) -> Iterator[tuple[int, Int8]]:

@@ -134,10 +134,7 @@ def find_moved(
 
 
 def _left_below(points: Float64, packed: Int64, moved: Bool, finest: Looks) -> Bool:
-    """Return bool (N,), points (N, 3) below those that moved whose finest cells were mostly free.
-
-    ``packed`` (N,) are their voxels.
-    """
+    """Return bool (N,), points below those that moved whose finest cells were mostly free."""
     rows = np.flatnonzero(~moved)
     rows = rows[_touching(packed[rows], np.unique(packed[moved]), _ABOVE) > 0]
     found = np.zeros(len(points), np.bool_)
@@ -159,10 +156,7 @@ def _among(home: Int64, points: Bool) -> Bool:
 def _mostly_free(
     keys: Int64, tells: Bool, voxels: OccupancyVoxels, evidence: CellEvidence
 ) -> tuple[Bool, Bool]:
-    """Return bool (N,), sorted cells with points around which most of those that tell are free.
-
-    And bool (N,), which are free themselves.
-    """
+    """Return two bool (N,): around which sorted cells most are free; which are free."""
     place, known = find_keys(keys, evidence[0])
     seen = np.full(len(keys), _MOST)
     seen[known] = evidence[1][place[known]]

@@ -119,10 +119,7 @@ def _rows_in(tree: Mapping[str, Any]) -> clamped.CellRows:
 
 
 def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints, wanted: Bool) -> Float32:
-    """Return log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses.
-
-    Those that are not ``wanted`` stay.
-    """
+    """Return log-odds (N,) of cells (N, 3); of those wanted, unsure where no surface crosses."""
     hit = log_odds > _UNSURE
     # What was hit and then looked through is no surface: a car that drove off, an outlier.
     points = points.select(are_among(points.keys, voxels.pack_keys(cells[hit])))

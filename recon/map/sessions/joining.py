@@ -117,10 +117,7 @@ def seen_before(map_: MapFile, session: Session) -> frozenset[int]:
 
 
 def path_up_to(session: Session) -> Float64:
-    """Return float64 (N,), path of a drive up to each frame; lost frames count several times.
-
-    Of known poses it is 0 everywhere: odometry, whose drift grows with the path, had no part in it.
-    """
+    """Return float64 (N,), path up to each frame; lost frames count more, known poses 0."""
     return DrivePath.of(session.odometry, session.health, session.scale).path_m
 
 
@@ -142,9 +139,9 @@ def doubts_of_lengths(map_: MapFile) -> list[str]:
 def times_as_long(
     one: Trajectory, other: Trajectory, links: Sequence[Loop]
 ) -> tuple[float, float] | None:
-    """Return how many times as long one drive is as another, and the standard deviation of that.
+    """Return how many times as long one path is as another, and its standard deviation.
 
-    The paths are those by odometry. None where there are too few links, or all are at one place.
+    None where there are too few links, or all are at one place.
     """
     if len(links) < _FEWEST:
         return None
@@ -209,10 +206,7 @@ def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Lin
 def _held_together(
     map_: MapFile, links: Sequence[Link]
 ) -> tuple[dict[int, Trajectory], Sequence[Link]]:
-    """Solve the graph until all of its drives are held by links that it believes.
-
-    Returns the path of each in the world of the first, by its number, and these links.
-    """
+    """Solve the graph until believed links hold all its drives; return paths and these."""
     while True:
         places = _reached(map_, links)
         inside = [link for link in links if set(link.sessions) <= set(places)]
@@ -231,10 +225,7 @@ def _held_together(
 
 
 def _reached(map_: MapFile, links: Sequence[Link]) -> dict[int, Float64]:
-    """Return about where the drives are that links or measured positions connect with the first.
-
-    By number, ``T_world_session`` (4, 4), in the world of the first.
-    """
+    """Return ``T_world_session``, about, of drives that links or positions connect."""
     found = {map_.sessions[0].number: np.eye(4)}
     surest = sorted(links, key=lambda link: -link.loop.inliers)
     while True:

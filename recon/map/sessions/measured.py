@@ -246,10 +246,7 @@ def _off_m(ours_m: Float64, there_m: Float64) -> Float64:
 
 
 def measure_along(session: Session, survey: Survey) -> Measured:
-    """Return the positions that were measured during a drive, and where its path has them.
-
-    Between frames that are trusted, the path is interpolated at their times.
-    """
+    """Return the positions that were measured during a drive, and where its path has them."""
     rows, path = survey.rows, _trusted_path(session)
     T_map_world = session.T_map_world
     antenna_m = _in_camera(survey, T_map_world)
@@ -315,10 +312,7 @@ def fixed_turn(
 
 
 def hold(map_: MapFile, survey: Survey) -> list[str]:
-    """Keep what was measured during any drive of a map with that drive; returns warnings.
-
-    `join_sessions` then bends their paths to run through these positions.
-    """
+    """Keep what was measured during any drive with it, for `join_sessions`; returns warnings."""
     times_s, lines = survey.rows[:, 0], list[str]()
     sessions = [each for each in map_.sessions if _during(_trusted_path(each), times_s).any()]
     for session in sessions or map_.sessions[:1]:  # of none, the first says why

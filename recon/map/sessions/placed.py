@@ -160,10 +160,7 @@ def has_occupancy(map_: MapFile) -> bool:
 
 
 def _to_be_cast(session: Session, settings: DriveSettings) -> bool:
-    """Return whether the occupancy of the only drive of a map is made from its rays.
-
-    One that is being mapped has that of its own settings; a finished one kept rays alone, if any.
-    """
+    """Return whether an only drive's occupancy was not kept, or made with other settings."""
     if not any(entry.cells for entry in session.submaps.entries):
         return session.ray_frames > 0
     made, wanted = settings_of(session).occupancy, settings.occupancy
@@ -344,10 +341,7 @@ def check_rays(session: Session, settings: DriveSettings) -> None:
 
 
 def keep_map(mapped: MapFile, path: Path) -> None:
-    """Write the map of finished drives: path, rays, keyframes, loops, and fused submaps.
-
-    Occupancy is left out, since `place_map` makes it from the rays again.
-    """
+    """Write the map of finished drives, but for occupancy, which is made of rays again."""
     with MapFile.create(path) as kept:
         for session in mapped.sessions:
             start = {name: kept_ for name, kept_ in session.info.start.items() if name == IMAGES}

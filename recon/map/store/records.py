@@ -236,10 +236,7 @@ class Store:
         self._insert(kind, _name(key), text, content)
 
     def get(self, kind: str, key: Key) -> dict[str, Any]:
-        """Return a record, which others may hold as well: copy it before changing it.
-
-        It has no large compressed arrays: see `read`.
-        """
+        """Return a record, not to be changed, without large compressed arrays: see `read`."""
         return self.cache.get((kind, key), lambda: self.read(kind, key))
 
     def read(self, kind: str, key: Key, *, most_bytes: int = 0) -> dict[str, Any]:
@@ -303,10 +300,7 @@ class Store:
         return found is not None and bool(found[0])
 
     def copy(self, kind: str, other: Store, keys: Mapping[Key, Key] | None = None) -> None:
-        """Copy records of a kind to another store without unpacking them.
-
-        ``keys`` are those to copy, with their keys in the other store; None = all, under their own.
-        """
+        """Copy records, packed, to another store; ``keys`` (None = all) with their keys there."""
         for key, new in ({k: k for k in self.keys(kind)} if keys is None else keys).items():
             with self._lock, reading(self.name):
                 text, content, checksum = self._row(kind, _name(key))

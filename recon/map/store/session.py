@@ -69,10 +69,7 @@ class SessionInfo:
 
 
 class Session:
-    """One drive in a map: its number, ``info``, ``submaps`` and ``keyframes``.
-
-    The next commit of the map keeps what is added.
-    """
+    """One drive in a map; the next commit of the map keeps what is added."""
 
     def __init__(self, store: Store, number: int) -> None:
         self._store = store

@@ -119,10 +119,7 @@ class Cluster:
                 give(islice(waiting, _AT_ONCE // 2))
 
     def each(self, function: Callable[[Any], None], items: Sequence[Any]) -> None:
-        """Run a function with each item on some worker, and wait until all is done.
-
-        One whose worker dies is called again on another, at most as often as Dask allows.
-        """
+        """Run a function with each item on a worker, again if that dies, and wait for all."""
         futures = self._client.map(function, items, key=uuid4().hex)
         for future in require("distributed", extra=EXTRA).as_completed(futures):
             if future.status == "finished":

@@ -93,10 +93,7 @@ class Outcome:
 
 
 def log_file(folder: Path, name: str) -> Path:
-    """Return the log of a job: what its tries said, between an `Outcome` at each begin and end.
-
-    A try is ``broken`` as long as it has not ended.
-    """
+    """Return the log of a job: what its tries said, between an `Outcome` at each begin and end."""
     return folder / LOGS / f"{name}.log"
 
 

@@ -54,10 +54,7 @@ class Entry(Settings):
 
 
 class JobList(Settings):
-    """What a batch is asked for: jobs, each with all combinations of the values of a sweep.
-
-    Relative paths begin in the folder.
-    """
+    """What a batch is asked for: jobs below a folder, each with all combinations of a sweep."""
 
     model_config = ConfigDict(strict=True)
 
@@ -116,10 +113,7 @@ def _job_list(content: Any, path: Path) -> JobList:
 
 
 def jobs_of_sources(command: str, sources: Sequence[str]) -> JobList:
-    """Return one job for each source, named by its last part.
-
-    Where two would have one name, each is named by as many of the last parts as tell all apart.
-    """
+    """Return one job for each source, named by as many last parts as tell all apart."""
     if not sources:
         raise SettingsError("there is no source", where=f"recon batch {command}")
     paths = [resolved(source).parts[1:] for source in sources]
