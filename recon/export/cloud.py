@@ -110,8 +110,14 @@ class CloudSample:
     def add(self, cloud: PointCloud) -> None:
         """Add points; all clouds are in map axes and have the same fields."""
         self._kept += [self._thinned(cloud)] if len(cloud) else []
-        if sum(map(len, self._kept)) > self._limit:
-            self._kept = [self._within_the_limit(join_clouds(self._kept))]
+        if sum(map(len, self._kept)) <= self._limit:
+            return
+        self._cell_m = self._cell_m or self._first_cell_m
+        thinned = self._thinned(join_clouds(self._kept))
+        while len(thinned) > self._limit:
+            self._cell_m *= _GROWTH
+            thinned = self._thinned(thinned)
+        self._kept = [thinned]
 
     def passing(self, tiles: Tiles) -> Iterator[PointCloud]:
         """Yield the clouds of tiles that have points, which are added."""
@@ -122,15 +128,6 @@ class CloudSample:
     def cloud(self) -> PointCloud:
         """Return the sample."""
         return join_clouds(self._kept)
-
-    def _within_the_limit(self, cloud: PointCloud) -> PointCloud:
-        """Thin a cloud, with growing cells, until it is within the limit."""
-        self._cell_m = self._cell_m or self._first_cell_m
-        thinned = self._thinned(cloud)
-        while len(thinned) > self._limit:
-            self._cell_m *= _GROWTH
-            thinned = self._thinned(thinned)
-        return thinned
 
     def _thinned(self, cloud: PointCloud) -> PointCloud:
         if self._cell_m is None:

@@ -145,8 +145,10 @@ class Cutter:
         """
         cut = Cut()
         for place, submap in enumerate(tracked(submaps, "submaps", "cut into tiles")):
-            T = None if T_corrected_world is None else T_corrected_world[place]
-            moved = self._moved(submap, T)
+            moved, config = submap, self._config
+            if T_corrected_world is not None and (T_corrected_world[place] != np.eye(4)).any():
+                sizes_m = (config.fusion.voxel_m, config.occupancy.resolution_m)
+                moved = submap.moved(T_corrected_world[place], self._T_map_world, *sizes_m)
             cut.add(moved)
             for kind, key, part, nbytes in self._pieces(moved, parts):
                 parts.put(kind, key, tree_of(part), first + place)
@@ -159,13 +161,6 @@ class Cutter:
     def centres_m(self, part: OccupancyPart) -> Float64:
         """Return float64 (B, 3), centres of the blocks of a part."""
         return np.asarray((part.blocks + 0.5) * (BLOCK_EDGE * self._config.occupancy.resolution_m))
-
-    def _moved(self, submap: Submap, T_corrected_world: Float64 | None) -> Submap:
-        if T_corrected_world is None or np.array_equal(T_corrected_world, np.eye(4)):
-            return submap
-        config = self._config
-        sizes_m = (config.fusion.voxel_m, config.occupancy.resolution_m)
-        return submap.moved(T_corrected_world, self._T_map_world, *sizes_m)
 
     def _pieces(
         self, submap: Submap, parts: TileParts

@@ -181,8 +181,12 @@ class FusedPart:
         ``sigma_m`` treats frames as independent, and the points of one frame in one voxel as one
         measurement. Voxels whose normals cancel are left out.
         """
-        rows = np.flatnonzero(self.enough(least, voxel_m))
-        part = self.select(rows[self._has_direction(rows)])
+        part = self.select(np.flatnonzero(self.enough(least, voxel_m)))
+        for each, columns in columns_in(self.known).items():
+            if each.fused == "direction" and each.name in self.known:
+                # 1e-3: below, the direction is that of rounding errors.
+                length = np.linalg.norm(part.sums[:, columns], axis=1)
+                part = part.select(length > 1e-3 * part.sums[:, 0])
         weight = part.sums[:, :1]
         found: dict[str, Any] = {
             each.name: each.of_means(part.sums[:, columns] / weight)
@@ -214,15 +218,6 @@ class FusedPart:
             return np.asarray(self.frames >= least)
         precise = self.information >= np.float32((_PRECISE * voxel_m) ** -2)
         return np.asarray(self.frames >= np.where(precise, max(1, least - 1), least))
-
-    def _has_direction(self, rows: NDArray[np.intp]) -> Bool:
-        """Return which voxels have normals that do not cancel; all, where normals are not known."""
-        has, weight = np.ones(len(rows), np.bool_), self.sums[rows, 0]
-        for each, columns in columns_in(self.known).items():
-            if each.fused == "direction" and each.name in self.known:
-                # 1e-3: below, the direction is that of rounding errors.
-                has &= np.linalg.norm(self.sums[rows, columns], axis=1) > 1e-3 * weight
-        return np.asarray(has)
 
 
 def sums_of(sums: Float32, known: tuple[str, ...], wanted: Collection[str]) -> Float32:

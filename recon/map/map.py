@@ -20,14 +20,16 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float32, Float64, Int8, Int64, freeze
 from recon.map.ground.grid import drop_undecided
-from recon.map.localize.localizer import Located, localize_pair
+from recon.map.localize.localizer import Localizer, Located
 from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.joining import join_new
 from recon.map.sessions.placed import place_map, settings_of
 from recon.map.settings import DriveSettings
-from recon.map.store.map_file import MapFile
+from recon.map.store.map_file import MapFile, known_places
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
+from recon.odometry.protocol import OdometryFrame
+from recon.stereo.frame import FrameReconstructor
 
 
 class Map(MapFile):
@@ -93,7 +95,11 @@ class Map(MapFile):
             ReconError: The map has no keyframes or is damaged, or images and calibration do not
                 fit together.
         """
-        return localize_pair(self, pair, calibration or self.first.camera, config)
+        rig = calibration or self.first.camera
+        reconstructor = FrameReconstructor(rig, config or DriveSettings())
+        # Several views of the map must show the place, since no second frame confirms it.
+        localizer = Localizer(known_places(self), frames=1)
+        return localizer.add(OdometryFrame(*reconstructor.match(pair)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -298,11 +298,15 @@ _PRIOR: Final = (
 def check_cloud(frame: ReconstructedFrame, settings: CloudSettings, where: str) -> None:
     """Refuse a pair whose matches give no point."""
     if not len(frame.cloud):
+        farthest = "any depth" if settings.max_range_m is None else f"{settings.max_range_m:g} m"
+        limits = f"from {settings.min_range_m:g} m to {farthest}"
+        if settings.max_relative_sigma is not None:
+            limits += f", known to {100 * settings.max_relative_sigma:g} % of it"
         raise MappingError(
             "the cloud is empty",
             where=where,
             got=_depths(frame.disparity, frame.pair.camera),
-            expected=f"points {_limits(settings)}",
+            expected=f"points {limits}",
             hint="check the unit of the baseline, or set cloud.max_range_m and "
             "cloud.max_relative_sigma",
         )
@@ -354,12 +358,3 @@ def _depths(disparity: Disparity, camera: RectifiedCamera) -> str:
     depth_m = depth_from_disparity(disparity.values[disparity.measured], camera)
     low, high = np.nanpercentile(depth_m, [5, 95])
     return f"{share}, at {low:.3g} to {high:.3g} m"
-
-
-def _limits(settings: CloudSettings) -> str:
-    """Return the depths and errors that a cloud takes, in words."""
-    farthest = "any depth" if settings.max_range_m is None else f"{settings.max_range_m:g} m"
-    limits = f"from {settings.min_range_m:g} m to {farthest}"
-    if settings.max_relative_sigma is None:
-        return limits
-    return f"{limits}, known to {100 * settings.max_relative_sigma:g} % of it"

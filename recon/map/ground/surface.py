@@ -112,8 +112,13 @@ def estimate_ground_surface(
     camera_height = settings.camera_height_m or field.camera_height()
     if math.isfinite(camera_height):
         field.grow(camera_height)
+    # The known heights are blurred with their neighbours; carried ones count a tenth.
+    known = np.isfinite(field.heights)
+    weight = known * np.where(field.measured, 1.0, 0.1)
+    total = cv2.GaussianBlur(weight * np.nan_to_num(field.heights), (5, 5), 1.0)
+    sums = cv2.GaussianBlur(weight, (5, 5), 1.0)
     return GroundSurface(
-        heights_m=_smooth(field.heights, field.measured),
+        heights_m=np.where(known, total / np.where(known, sums, 1.0), np.nan),
         cell_m=field.cell_m,
         origin_m=field.origin,
         camera_height_m=camera_height,
@@ -158,7 +163,12 @@ class _Field:
         self.heights = np.full((rows, columns), np.nan)
         self.measured = np.zeros((rows, columns), dtype=np.bool_)
         self._gap = np.full((rows, columns), np.inf)
-        self._path_z = self._path_height(path)
+        # Mean height of the path in each cell that it crosses; NaN elsewhere.
+        cells, _ = self._cells_of(path)
+        number = np.bincount(cells, minlength=rows * columns)
+        total = np.bincount(cells, weights=path[:, 2], minlength=rows * columns)
+        mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+        self._path_z = mean.reshape(self.heights.shape)
         # Steps, to 8 neighbours, from the nearest cell below the path.
         away = np.where(np.isfinite(self._path_z), 0, 255).astype(np.uint8)
         steps = np.rint(cv2.distanceTransform(away, cv2.DIST_C, 3)).astype(np.int32)
@@ -240,15 +250,6 @@ class _Field:
             gap = np.where(known, np.minimum(gap, self._gap[r, c]), gap)
         return np.where(number > 0, total / np.maximum(number, 1), np.nan), gap
 
-    def _path_height(self, path: Float64) -> Float64:
-        """Return mean height of the path in each cell that it crosses; NaN elsewhere."""
-        cells, _ = self._cells_of(path)
-        size = self.heights.size
-        number = np.bincount(cells, minlength=size)
-        total = np.bincount(cells, weights=path[:, 2], minlength=size)
-        mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-        return np.asarray(mean.reshape(self.heights.shape))
-
     def _points(self, cloud: PointCloud) -> tuple[NDArray[np.intp], Float64]:
         xyz = cloud.xyz.astype(np.float64)
         if cloud.normals is not None:
@@ -276,15 +277,6 @@ def _densify(path: Float64, step_m: float) -> Float64:
     along = np.concatenate([[0.0], np.cumsum(pieces)])
     wanted = np.linspace(0.0, along[-1], max(2, math.ceil(along[-1] / step_m) + 1))
     return np.stack([np.interp(wanted, along, path[:, axis]) for axis in range(3)], axis=1)
-
-
-def _smooth(heights: Float64, measured: Bool) -> Float64:
-    """Blur the known heights with their neighbours; carried ones count a tenth."""
-    known = np.isfinite(heights)
-    weight = known * np.where(measured, 1.0, 0.1)
-    total = cv2.GaussianBlur(weight * np.nan_to_num(heights), (5, 5), 1.0)
-    sums = cv2.GaussianBlur(weight, (5, 5), 1.0)
-    return np.where(known, total / np.where(known, sums, 1.0), np.nan)
 
 
 _FULL: Final = log_odds(0.6)

@@ -112,7 +112,14 @@ def measure_relief(
             sigma_m = cloud.sigma_m[used].astype(np.float64)
             cells, values = _one_frame(cell[used], rays, height, sigma_m, _WINDOW_PX / focal_px)
             sums[cells] += values
-    return _relief(sums, raster)
+    total, z, zz, variance, squares, *blur = sums.T.reshape(-1, *raster.shape)
+    # What few frames saw may have moved, or be mismatched.
+    weight = np.where((total > 0) & (total**2 >= _FRAMES * squares), total, np.nan)
+    height_m = z / weight
+    # As much as frames and points of a cell differ, if that is more than they say.
+    scatter = np.maximum(zz / weight - height_m**2, 0.0) * squares / weight**2
+    sigma_m = np.sqrt(np.maximum(variance / weight**2, scatter) + _LEAST_SIGMA_M**2)
+    return Relief(raster, height_m, sigma_m, np.stack([one / weight for one in blur]))
 
 
 def _one_frame(
@@ -130,17 +137,6 @@ def _one_frame(
     z, zz, sigma, xx, xy, yy = [np.bincount(home, one) for one in columns] / np.bincount(home)
     w = 1 / (xx + yy)  # sharp views count more
     return cells, np.stack([w, w * z, w * zz, (w * sigma) ** 2, w**2, w * xx, w * xy, w * yy], 1)
-
-
-def _relief(sums: Float64, raster: Raster) -> Relief:
-    total, z, zz, variance, squares, *blur = sums.T.reshape(-1, *raster.shape)
-    # What few frames saw may have moved, or be mismatched.
-    weight = np.where((total > 0) & (total**2 >= _FRAMES * squares), total, np.nan)
-    height_m = z / weight
-    # As much as frames and points of a cell differ, if that is more than they say.
-    scatter = np.maximum(zz / weight - height_m**2, 0.0) * squares / weight**2
-    sigma_m = np.sqrt(np.maximum(variance / weight**2, scatter) + _LEAST_SIGMA_M**2)
-    return Relief(raster, height_m, sigma_m, np.stack([one / weight for one in blur]))
 
 
 class Judged(NamedTuple):

@@ -34,8 +34,20 @@ def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = (
     They keep their numbers where the other map is empty, else they get the next ones.
     """
     chosen = [session for session in source.sessions if session.number not in without]
-    for session in chosen:
-        _refuse_again(session, target)
+    known = [other.odometry for other in target.sessions]
+    for session in chosen:  # one that a map has already would be evidence of its own
+        path = session.odometry
+        if any(
+            np.array_equal(other.T_world_camera, path.T_world_camera)
+            and np.array_equal(other.timestamps_s, path.timestamps_s)
+            for other in known
+        ):
+            raise FormatError(
+                "the map has this drive already",
+                where=session.where,
+                got=f"{session.info.source}, {counted(len(session), 'frame')}",
+                expected="another drive",
+            )
     after = max((session.number for session in target.sessions), default=-1) + 1
     first = chosen[0].number if chosen and after else 0
     numbers = {session.number: session.number - first + after for session in chosen}
@@ -119,22 +131,6 @@ def _renumbered(keys: list[Key], numbers: dict[int, int]) -> dict[Key, Key]:
         if session in numbers:
             found[key] = (numbers[session], *rest) if rest else numbers[session]
     return found
-
-
-def _refuse_again(session: Session, target: MapFile) -> None:
-    """Refuse a drive that a map has already: it would be evidence of its own."""
-    path = session.odometry
-    for other in target.sessions:
-        known = other.odometry
-        if np.array_equal(known.T_world_camera, path.T_world_camera) and np.array_equal(
-            known.timestamps_s, path.timestamps_s
-        ):
-            raise FormatError(
-                "the map has this drive already",
-                where=session.where,
-                got=f"{session.info.source}, {counted(len(session), 'frame')}",
-                expected="another drive",
-            )
 
 
 def _append_frames(session: Session, part: Session, lead: int) -> Float64:

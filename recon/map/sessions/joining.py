@@ -52,7 +52,14 @@ def join_sessions(map_: MapFile, links: Sequence[Link]) -> None:
     paths, believed = _held_together(map_, links)
     for session in map_.sessions:
         if session.number in paths:
-            _place(map_, session, paths[session.number])
+            path, loops = paths[session.number].T_world_camera, {**NO_LOOPS, **session.loops}
+            T_world_session = path[0] @ invert(session.odometry.T_world_camera[0])
+            alone = loops.get(ALONE, loops[BENT])
+            bent = invert(T_world_session) @ path
+            session.set_loops({**loops, ALONE: alone, BENT: bent})
+            if session is not map_.sessions[0]:
+                T_map_session = map_.sessions[0].T_map_world @ T_world_session
+                session.set_axes(T_map_session, session.camera)
         elif ALONE in session.loops:
             session.set_loops({**session.loops, BENT: session.loops[ALONE]})
     kept, linked = set(map(id, believed)), paths or [map_.sessions[0].number]
@@ -306,15 +313,3 @@ def _held(map_: MapFile, sessions: Sequence[Session], drives: Sequence[DrivePath
     # Numbers of millions of metres would cost the optimiser digits.
     near = [replace(each, position_m=each.position_m - centre_m) for each in fixes]
     return Held(invert(T_map_world) @ T_map_survey, near)
-
-
-def _place(map_: MapFile, session: Session, path: Trajectory) -> None:
-    """Write where a drive is: its axes, and how its path is bent."""
-    T_world_session = path.T_world_camera[0] @ invert(session.odometry.T_world_camera[0])
-    bent = invert(T_world_session) @ path.T_world_camera
-    loops = {**NO_LOOPS, **session.loops}
-    alone = loops.get(ALONE, loops[BENT])
-    session.set_loops({**loops, ALONE: alone, BENT: bent})
-    first = map_.sessions[0]
-    if session is not first:
-        session.set_axes(first.T_map_world @ T_world_session, session.camera)

@@ -316,8 +316,19 @@ def hold(map_: MapFile, survey: Survey) -> list[str]:
     times_s, lines = survey.rows[:, 0], list[str]()
     sessions = [each for each in map_.sessions if _during(_trusted_path(each), times_s).any()]
     for session in sessions or map_.sessions[:1]:  # of none, the first says why
-        measured = measure_along(session, survey)
-        session.set_fixes(_fixes(session, measured, survey))
+        measured, path = measure_along(session, survey), _trusted_path(session)
+        # Those that agree, by frame; between frames the path is trusted.
+        times_s, T_world_frame = measured.times_s[measured.agree], session.trajectory.T_world_camera
+        frames = nearest_sorted(times_s, session.trajectory.timestamps_s)
+        T_frame_camera = invert(T_world_frame[frames]) @ interpolate_poses(path, times_s)
+        session.set_fixes(
+            Fixes(
+                frames,
+                _placed(T_frame_camera, _in_camera(survey, session.T_map_world)),
+                measured.position_m[measured.agree],
+                measured.sigma_m[measured.agree],
+            )
+        )
         lines += measured.warnings()
     return [*survey.notes(), *lines]
 
@@ -342,20 +353,6 @@ def doubts_of_positions(map_: MapFile) -> list[str]:
         return []
     why = "another clock, another antenna offset, other units, or positions that are no better"
     return [f"the paths are {metres(off_m)} from the measured positions (RMS): {why}"]
-
-
-def _fixes(session: Session, measured: Measured, survey: Survey) -> Fixes:
-    """Return the positions of a drive that agree, by frame; between frames its path is trusted."""
-    path = _trusted_path(session)
-    times_s, T_world_frame = measured.times_s[measured.agree], session.trajectory.T_world_camera
-    frames = nearest_sorted(times_s, session.trajectory.timestamps_s)
-    T_frame_camera = invert(T_world_frame[frames]) @ interpolate_poses(path, times_s)
-    return Fixes(
-        frames,
-        _placed(T_frame_camera, _in_camera(survey, session.T_map_world)),
-        measured.position_m[measured.agree],
-        measured.sigma_m[measured.agree],
-    )
 
 
 def _placed(T: Float64, point_m: Float64) -> Float64:
