@@ -20,7 +20,7 @@ from recon.core.geometry.se3 import invert
 from recon.core.kernels import voxels
 from recon.core.settings import Length, Settings
 from recon.core.values import Frame, OccupancyVoxels, PointCloud, RayCloud, RayGrain
-from recon.core.values.arrays import Float32, Float64, Int32
+from recon.core.values.arrays import Float32, Float64
 from recon.core.values.grid import log_odds
 from recon.map.fusion import ALL, FusedPart, FusionSettings, columns_in, sums_in, sums_of
 from recon.map.kernels import clamped, raycast
@@ -210,7 +210,15 @@ def frame_rays(cloud: PointCloud, T_map_camera: Float64, s: OccupancySettings) -
         s.max_range_m / s.resolution_m,
         FREE_MARGIN_SIGMAS,
     )
-    means, values = _reduce(ends, values, cloud.count, _MIN_POINTS)
+    # Mean ends and values of each voxel with enough trusted points.
+    weights = (values[:, 2] > 0).astype(np.float32)
+    weights = weights if cloud.count is None else weights * cloud.count.astype(np.float32)
+    points = voxels.VoxelPoints(ends, weights, values)
+    sums = voxels.add_points(voxels.make_sums(4096, values.shape[1]), points, 1.0, 0)
+    enough = np.flatnonzero(sums.sums[: sums.used[0], 0] >= _MIN_POINTS)
+    found = sums.sums[enough, 1:] / sums.sums[enough, :1]
+    means = voxels.unpack_keys(sums.keys[enough]) + 0.5 + found[:, :3]
+    values = found[:, 3:]
     sigma, free, confidence, hit = np.ascontiguousarray(values.T)
     return raycast.Rays(
         origin=T[:3, 3].copy(),
@@ -228,20 +236,6 @@ def _hits(rays: raycast.Rays) -> voxels.VoxelPoints:
     variances = rays.sigma[hit] ** 2 + _LEAST_SIGMA_CELLS**2
     weights, values = (1 / variances).astype(np.float32), variances[:, None].astype(np.float32)
     return voxels.VoxelPoints(rays.ends[hit], weights, values)
-
-
-def _reduce(
-    ends: Float32, values: Float32, count: Int32 | None, least: int
-) -> tuple[Float64, Float32]:
-    """Return mean ends (M, 3) and values (M, C) of each voxel with ``least`` trusted points."""
-    trusted = (values[:, 2] > 0).astype(np.float32)
-    weights = trusted if count is None else trusted * count.astype(np.float32)
-    points = voxels.VoxelPoints(ends, weights, values)
-    sums = voxels.add_points(voxels.make_sums(4096, values.shape[1]), points, 1.0, 0)
-    enough = np.flatnonzero(sums.sums[: sums.used[0], 0] >= least)
-    means = sums.sums[enough, 1:] / sums.sums[enough, :1]
-    centres = voxels.unpack_keys(sums.keys[enough]) + 0.5
-    return centres + means[:, :3], means[:, 3:]
 
 
 def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:

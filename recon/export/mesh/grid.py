@@ -16,7 +16,7 @@ import numpy as np
 
 from recon.core.errors import MeshingError
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64
+from recon.core.values.arrays import Bool, Float64, Int32, Int64
 from recon.export.mesh.cut import components, meeting_sides, renumbered, vertex_normals
 from recon.export.mesh.poisson import MeshSettings, simplified, usable
 
@@ -382,7 +382,15 @@ def closed_behind(mesh: TriangleMesh, thickness_m: float) -> TriangleMesh:
         what, expected = "the solid is too thin for its distance", f"at least {least_m:.3g} m"
         hint = "raise mesh.pair_solid_m"
         raise MeshingError(what, got=f"{thickness_m:g} m", expected=expected, hint=hint)
-    front = _moved_apart(mesh.vertices, mesh.faces)
+    # No two vertices may be in one place: else programs join them again.
+    _, place, count = np.unique(mesh.vertices, axis=0, return_inverse=True, return_counts=True)
+    middles = mesh.vertices[mesh.faces].mean(axis=1, dtype=np.float64)
+    corner, face = mesh.faces.ravel(), np.repeat(np.arange(len(mesh.faces)), 3)
+    number = np.maximum(np.bincount(corner, minlength=len(mesh.vertices)), 1)
+    inside = [np.bincount(corner, axis[face], len(mesh.vertices)) / number for axis in middles.T]
+    moved = mesh.vertices + _APART * (np.stack(inside, axis=1) - mesh.vertices)
+    shared = count[place.ravel()] > 1
+    front = np.where(shared[:, None], moved, mesh.vertices).astype(np.float32)
     back = front * (1 + thickness_m / front[:, 2:].astype(np.float64))
     vertices = np.concatenate([front, back]).astype(np.float32)
     # The edges that one triangle alone has, in its direction.
@@ -395,15 +403,3 @@ def closed_behind(mesh: TriangleMesh, thickness_m: float) -> TriangleMesh:
     faces = np.concatenate([mesh.faces, behind[:, ::-1], walls]).astype(np.int32)
     rgb = None if mesh.rgb is None else np.concatenate([mesh.rgb, mesh.rgb])
     return TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)
-
-
-def _moved_apart(vertices: Float32, faces: Int32) -> Float32:
-    """Return vertices (V, 3), of which no two are in one place: else programs join them again."""
-    _, place, count = np.unique(vertices, axis=0, return_inverse=True, return_counts=True)
-    shared = count[place.ravel()] > 1
-    middles = vertices[faces].mean(axis=1, dtype=np.float64)
-    corner, face = faces.ravel(), np.repeat(np.arange(len(faces)), 3)
-    number = np.maximum(np.bincount(corner, minlength=len(vertices)), 1)
-    inside = [np.bincount(corner, axis[face], len(vertices)) / number for axis in middles.T]
-    moved = vertices + _APART * (np.stack(inside, axis=1) - vertices)
-    return np.where(shared[:, None], moved, vertices).astype(np.float32)

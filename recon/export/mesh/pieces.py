@@ -175,18 +175,16 @@ class _Mesher:
             if len(mesh.faces):
                 paths.append(self.folder / f"tile_{key[0]}_{key[1]}.ply")
                 write_mesh(paths[-1], mesh)
-        ends = np.cumsum([*map(len, self.sizes)], dtype=np.int64)
-        kept = np.split(self._large_enough(), ends)[: len(paths)]
-        pieces = [_without_crumbs(*each) for each in zip(paths, kept, strict=True)]
-        return [piece for piece in pieces if piece.faces], self._warnings(failed)
-
-    def _large_enough(self) -> Bool:
-        """Return bool (C,), components of enough faces, with those that they meet in seams."""
+        # Components of enough faces, with those that they meet in seams.
         sizes = np.concatenate([np.zeros(0, np.int32), *self.sizes])
         met = np.concatenate([np.zeros((0, 2), np.int64), *self.seams])
         whole = components(met, len(sizes))
         least = self.settings.min_component_faces if self.settings.target_faces is None else 1
-        return np.asarray((np.bincount(whole, sizes) >= least)[whole])
+        large = (np.bincount(whole, sizes) >= least)[whole]
+        ends = np.cumsum([*map(len, self.sizes)], dtype=np.int64)
+        kept = np.split(large, ends)[: len(paths)]
+        pieces = [_without_crumbs(*each) for each in zip(paths, kept, strict=True)]
+        return [piece for piece in pieces if piece.faces], self._warnings(failed)
 
     def _warnings(self, failed: dict[PieceKey, MeshingError]) -> list[str]:
         """Return a line about the pieces without a surface, naming the one with the most points."""

@@ -130,7 +130,12 @@ def reconstruct_mesh(
     )
     supported = density >= np.quantile(density, settings.trim_density_quantile)
     if settings.max_distance_spacings is not None:
-        supported &= _near_data(vertices, cloud.xyz, settings.max_distance_spacings)
+        index, distance_m = open3d_clouds.nearest(vertices, cloud.xyz)
+        near, where = np.unique(index[:, 0], return_inverse=True)
+        local_m = _spacing(cloud.xyz[near], cloud.xyz)
+        # A lone point is far from its neighbours, and must not support a large patch of surface.
+        local_m = np.minimum(local_m, 2 * np.median(local_m))
+        supported &= distance_m[:, 0] <= settings.max_distance_spacings * local_m[where]
     return trimmed(keep_vertices(vertices, faces, supported), cloud, settings, wrong)
 
 
@@ -216,16 +221,6 @@ def typical_spacing_m(xyz: Float32) -> float:
 def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:
     """Return float32 (N,): distance of points of a cloud to their seventh neighbour in it."""
     return open3d_clouds.nearest(some_xyz, xyz, _SPACING_NEIGHBOURS)[1][:, -1]
-
-
-def _near_data(vertices: Float32, xyz: Float32, spacings: float) -> Bool:
-    """Return bool (V,): vertices within ``spacings`` local point spacings of the nearest point."""
-    index, distance_m = open3d_clouds.nearest(vertices, xyz)
-    near, where = np.unique(index[:, 0], return_inverse=True)
-    local_m = _spacing(xyz[near], xyz)
-    # A lone point is far from its neighbours, and must not support a large patch of surface.
-    local_m = np.minimum(local_m, 2 * np.median(local_m))
-    return np.asarray(distance_m[:, 0] <= spacings * local_m[where])
 
 
 _OF_SEVENTH: Final = math.sqrt(math.pi / 7)

@@ -66,9 +66,16 @@ class Drive:
         self._saved = 0
         self._start = self._last = self._saved_s = time.perf_counter()
         with resuming(self._map.store.name):
-            state = self.session.state()
-            if state is not None:
-                self._restore(state)
+            if (state := self.session.state()) is None:
+                return
+            self.mapper.restore(state["mapper"])
+            if state.get("last_view") is not None:  # none of a drive put together of pieces
+                self._views.last = LastView(**state["last_view"])
+            if len(self.session):
+                path, health = self.session.odometry, self.session.health
+                self._loops.restore(path.T_world_camera, stretches(health))
+            self._saved = len(self.mapper)
+            self._start = self._last - state["seconds"]
 
     def begin_at(self, frame: int) -> None:
         """Lay the axes of the map by the ground of a frame, and save what the odometry found."""
@@ -118,7 +125,10 @@ class Drive:
         self._loops.add(frame, result.T_world_camera, result.stretch)
         if result.index <= self._total // 2 and (self.sample is None or len(frame.cloud)):
             self.sample = frame
-        if self._due():
+        due = len(self.mapper) - self._saved >= self.config.checkpoints.every_frames
+        if self.source.live:
+            due = time.perf_counter() - self._saved_s >= _COMMIT_S
+        if due:
             self._save()
         self.config.memory.check(f"frame {result.index}")
         now = time.perf_counter()
@@ -162,22 +172,6 @@ class Drive:
     def seconds(self) -> float:
         """Time from the first frame to the last."""
         return self._last - self._start
-
-    def _due(self) -> bool:
-        if self.source.live:
-            return time.perf_counter() - self._saved_s >= _COMMIT_S
-        return len(self.mapper) - self._saved >= self.config.checkpoints.every_frames
-
-    def _restore(self, state: dict[str, Any]) -> None:
-        self.mapper.restore(state["mapper"])
-        if state.get("last_view") is not None:  # none of a drive that was put together of pieces
-            self._views.last = LastView(**state["last_view"])
-        if len(self.session):
-            path, health = self.session.odometry, self.session.health
-            self._loops.restore(path.T_world_camera, stretches(health))
-        self._saved = len(self.mapper)
-        self._last = time.perf_counter()
-        self._start = self._last - state["seconds"]
 
     def _save(self) -> None:
         if self._map.store.path is None:

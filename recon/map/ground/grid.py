@@ -208,7 +208,16 @@ def sweep(points_m: Float64, ground: GroundSurface, width_m: float, resolution_m
     """
     off_m = np.abs(ground.drop_at(points_m[:, :2]) - ground.camera_height_m)
     on_ground = ~(off_m > _SAME_M)  # not above something else; ground that was not seen is ground
-    columns, top_m = _columns_near(points_m[on_ground], width_m, resolution_m)
+    # Columns (N, 2) near the path, each once, and its lowest height near each.
+    points_m = points_m[on_ground]
+    reach = int(np.ceil(width_m / 2 / resolution_m)) + 1
+    around = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
+    beside = np.floor(points_m[:, :2] / resolution_m).astype(np.int64)[:, None] + around
+    offset = (beside + 0.5) * resolution_m - points_m[:, None, :2]
+    near = (np.linalg.norm(offset, axis=2) <= width_m / 2) | (around == 0).all(axis=1)
+    columns, place = np.unique(beside[near], axis=0, return_inverse=True)
+    top_m = np.full(len(columns), np.inf)
+    np.minimum.at(top_m, place.ravel(), points_m[np.nonzero(near)[0], 2])
     floor_m = ground.height_at((columns + 0.5) * resolution_m)
     known = np.isfinite(floor_m)
     columns, floor_m, top_m = columns[known], floor_m[known], top_m[known]
@@ -218,17 +227,3 @@ def sweep(points_m: Float64, ground: GroundSurface, width_m: float, resolution_m
     above = np.arange(number.sum()) - np.repeat(np.cumsum(number) - number, number)
     keys = np.column_stack([np.repeat(columns, number, axis=0), np.repeat(first, number) + above])
     return keys.astype(np.int32)
-
-
-def _columns_near(points_m: Float64, width_m: float, resolution_m: float) -> tuple[Int64, Float64]:
-    """Return columns (N, 2) near the path, each once, and its lowest height near each, (N,)."""
-    reach = int(np.ceil(width_m / 2 / resolution_m)) + 1
-    around = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
-    home = np.floor(points_m[:, :2] / resolution_m).astype(np.int64)
-    columns = home[:, None] + around
-    offset = (columns + 0.5) * resolution_m - points_m[:, None, :2]
-    near = (np.linalg.norm(offset, axis=2) <= width_m / 2) | (around == 0).all(axis=1)
-    found, place = np.unique(columns[near], axis=0, return_inverse=True)
-    top_m = np.full(len(found), np.inf)
-    np.minimum.at(top_m, place.ravel(), points_m[np.nonzero(near)[0], 2])
-    return found, top_m

@@ -52,7 +52,12 @@ def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = (
     first = chosen[0].number if chosen and after else 0
     numbers = {session.number: session.number - first + after for session in chosen}
     for kind in _KINDS:
-        source.store.copy(kind, target.store, _renumbered(source.store.keys(kind), numbers))
+        keys: dict[Key, Key] = {}
+        for key in source.store.keys(kind):
+            session, *rest = key if isinstance(key, tuple) else (key,)
+            if session in numbers:
+                keys[key] = (numbers[session], *rest) if rest else numbers[session]
+        source.store.copy(kind, target.store, keys)
     linked = [numbers[s.number] for s in source.linked if s.number in numbers]
     links = [
         replace(link, sessions=(numbers[link.sessions[0]], numbers[link.sessions[1]]))
@@ -121,16 +126,6 @@ def check_session(session: Session, settings: DriveSettings) -> None:
             hint="map one again with --set scene.scale= or fusion.voxel_m= of the other",
         )
     check_rays(session, settings)
-
-
-def _renumbered(keys: list[Key], numbers: dict[int, int]) -> dict[Key, Key]:
-    """Return the keys of some drives, and what they become with new numbers of drives."""
-    found: dict[Key, Key] = {}
-    for key in keys:
-        session, *rest = key if isinstance(key, tuple) else (key,)
-        if session in numbers:
-            found[key] = (numbers[session], *rest) if rest else numbers[session]
-    return found
 
 
 def _append_frames(session: Session, part: Session, lead: int) -> Float64:

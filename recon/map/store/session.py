@@ -81,7 +81,12 @@ class Session:
         with reading(store.name):
             self.info = value_in(SessionInfo, store.read(SESSION, number))
             self._read_frames()
-            self._check_loops()
+            for name in (BENT, ALONE):
+                if (poses := self.loops.get(name)) is not None:
+                    path_of(poses, np.array(self._times_s))
+            for loop in map(loop_in, self.loops.get("closed", ())):
+                if not 0 <= loop.first < loop.last < len(self):
+                    raise FormatError("a loop of the map is not between two frames", got=f"{loop}")
         self.submaps = Submaps(store, number)
         if self.submaps.frames > len(self):
             raise FormatError("the map has submaps of frames without a pose", where=store.name)
@@ -250,15 +255,6 @@ class Session:
         self._flushed = len(self)
         if sorted(self._times_s) != self._times_s:
             raise FormatError("frames of the drive are not in order")
-
-    def _check_loops(self) -> None:
-        for name in (BENT, ALONE):
-            if (poses := self.loops.get(name)) is not None:
-                path_of(poses, np.array(self._times_s))
-        for tree in self.loops.get("closed", ()):
-            loop = loop_in(tree)
-            if not 0 <= loop.first < loop.last < len(self):
-                raise FormatError("a loop of the map is not between two frames", got=f"{loop}")
 
 
 SUBMAP: Final = "submap"

@@ -181,20 +181,18 @@ def _remarks(group: Sequence[JobResult]) -> Iterator[tuple[str, str]]:
     compared = [name for name in names if name.rpartition(".")[2] in _LEAST_SPREAD]
     if len(done) < _LEAST_JOBS or not compared:
         return
-    far = {name: _far(name, [one.figures[name] for one in done]) for name in compared}
+    far: dict[str, list[float]] = {}  # by how many standard deviations worse than their median
+    for name in compared:
+        values, least = [one.figures[name] for one in done], _LEAST_SPREAD[name.rpartition(".")[2]]
+        median = statistics.median(values)
+        spread = _SIGMAS * statistics.median(abs(value - median) for value in values)
+        spread = math.copysign(max(spread, _LEAST_SHARE * abs(median), abs(least)), least)
+        far[name] = [(value - median) / spread for value in values]
     for number, one in enumerate(done):
         most, name = max((far[name][number], name) for name in compared)
         if most >= _UNUSUAL:
             usual = statistics.median(each.figures[name] for each in done)
             yield one.job.name, f"{name} {one.figures[name]:.4g} (usually {usual:.4g})"
-
-
-def _far(name: str, values: Sequence[float]) -> list[float]:
-    """Return by how many standard deviations figures are worse than their median."""
-    least, median = _LEAST_SPREAD[name.rpartition(".")[2]], statistics.median(values)
-    spread = _SIGMAS * statistics.median(abs(value - median) for value in values)
-    spread = math.copysign(max(spread, _LEAST_SHARE * abs(median), abs(least)), least)
-    return [(value - median) / spread for value in values]
 
 
 def watch_jobs(
