@@ -51,7 +51,6 @@ class Progress(Protocol):
         return
 
     def on_step(self, step: Step) -> None:
-        """Count an item that is done."""
         return
 
     def on_stage(self, name: str) -> None:

@@ -111,12 +111,10 @@ class OneBehind:
         self._job: Future[None] | None = None
 
     def begin(self, job: Callable[[], None]) -> None:
-        """Start a job once the previous one has ended."""
         self.wait()
         self._job = self._pool.submit(job)
 
     def wait(self) -> None:
-        """Wait until the last job has ended."""
         job, self._job = self._job, None
         if job is not None:
             job.result()

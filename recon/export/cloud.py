@@ -126,7 +126,6 @@ class CloudSample:
             yield cloud
 
     def cloud(self) -> PointCloud:
-        """Return the sample."""
         return join_clouds(self._kept)
 
     def _thinned(self, cloud: PointCloud) -> PointCloud:

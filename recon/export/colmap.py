@@ -13,7 +13,6 @@ from recon.core.values.camera import project
 from recon.export.product import DriveImages, Made, Order
 from recon.io.images.image import write_image
 from recon.io.models.colmap import ColmapModel, Seen, write_colmap
-from recon.map.store.trees import loop_in
 from recon.places.adjustment import shared_points
 from recon.places.closure import Closure, DrivePath
 from recon.sources.source import check_source
@@ -46,8 +45,7 @@ class _Written:
         self._drive, self._model, self._first = drive, model, first
         session = drive.session
         path = DrivePath.of(session.odometry, session.health, session.scale)
-        loops = tuple(loop_in(tree) for tree in session.loops.get("closed", ()))
-        closure, keyframes = Closure(session.trajectory, loops, ()), session.keyframes
+        closure, keyframes = Closure(session.trajectory, session.closed, ()), session.keyframes
         among = [frame for frame in keyframes.frames if drive.placed[frame]]
         self._camera = session.camera
         self._points = shared_points(path, closure, keyframes, self._camera, among)
@@ -86,7 +84,6 @@ class _Written:
         return [(np.column_stack([x, v])[k], points[k] + self._first) for x, _, k in views]
 
     def add_points(self) -> int:
-        """Add the points; their number."""
         off_px = self._off_px / np.maximum(1, [*map(len, self._tracks)])
         each = zip(self._xyz, self._rgb.tolist(), off_px.tolist(), self._tracks, strict=True)
         for number, point in enumerate(each, start=self._first):

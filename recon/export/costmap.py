@@ -15,8 +15,8 @@ from recon.export.product import Made, Order
 from recon.export.rasters import ground_slopes
 from recon.io.models.nav2 import write_nav2_costs
 from recon.io.models.ros_bag import Message, header, pose, write_bag
-from recon.map.ground.surface import GroundSurface
-from recon.map.ground.traverse import UNSURE, Raster, costs, judge, measure_relief, widened
+from recon.map.ground.surface import GroundSurface, Raster
+from recon.map.ground.traverse import UNSURE, costs, judge, measure_relief, widened
 from recon.map.map import Map
 from recon.map.sessions.placed import PlacedMap
 

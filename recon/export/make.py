@@ -72,7 +72,6 @@ class Products:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Their figures for the summary."""
         return {name: value for one in self.made.values() for name, value in one.figures.items()}
 
     @property

@@ -108,7 +108,6 @@ class _Drive:
             yield from images.views()
 
     def write(self, bag: RosBag, frame: int, views: tuple[UInt8, ...]) -> None:
-        """Write all messages of a frame."""
         time_ns, T, base = self.times_ns[frame], self._T_map_base[frame], f"{self.name}base_link"
         bag.write("/tf", time_ns, _transforms(time_ns, [("map", base, T)]))
         spread = np.diag(np.repeat(self._variance[frame], 3)).ravel()

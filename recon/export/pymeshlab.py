@@ -33,8 +33,9 @@ def screened_poisson(
     Args:
         xyz: Metres.
         normals: Of the points.
-        depth: Depth of the octree: its edge has 2^depth cells.
-        scale: Edge of the octree, as a multiple of the longest side of the cloud.
+        depth: Depth of the octree: its edge, ``scale`` times the longest side of the cloud, has
+            2^depth cells.
+        scale: See ``depth``.
         point_weight: Weight of interpolating the points relative to fitting the normals.
 
     Returns:

@@ -248,7 +248,6 @@ def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:
 
 
 def _check_cloud(cloud: PointCloud, frame: Frame, what: str) -> None:
-    """Refuse a cloud that would silently spoil the map."""
     if cloud.frame != frame:
         raise MappingError(f"{what} takes clouds in {frame} axes", got=cloud.frame, expected=frame)
     if not all(np.isfinite(values).all() for values in cloud.arrays.values()):
@@ -331,7 +330,6 @@ class Submap:
     def moved(
         self, T_corrected_world: Float64, T_map_world: Float64, voxel_m: float, resolution_m: float
     ) -> Submap:
-        """Return the submap after a correction of its pose."""
         T_corrected_map = T_map_world @ T_corrected_world @ invert(T_map_world)
         return replace(
             self,
@@ -341,7 +339,6 @@ class Submap:
 
     @classmethod
     def from_tree(cls, tree: dict[str, Any]) -> Submap:
-        """Return the submap that a tree (`tree_of`) is of."""
         return cls(
             tree["index"],
             tree["first_frame"],

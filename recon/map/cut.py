@@ -50,7 +50,6 @@ class Cut:
     nbytes: Counter[tuple[str, TileKey]] = field(default_factory=Counter)
 
     def add(self, submap: Submap) -> None:
-        """Add the next submap, where it was put."""
         self.frames.append(submap.frames)
         self.known &= set(submap.fused.known if len(submap.fused) else ALL)
         columns = submap.occupancy.cells[:, :2]

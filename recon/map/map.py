@@ -177,7 +177,6 @@ def _checked(xyz: ArrayLike) -> Float64:
 
 
 def _states(tiles: Tiles, cells: Int64) -> Int8:
-    """Return int8 (N,), what cells (N, 3) are."""
     states, homes = np.full(len(cells), UNKNOWN, np.int8), cells[:, :2] // tiles.edge_cells
     for x, y in np.unique(homes, axis=0).tolist():
         rows = np.flatnonzero((homes == (x, y)).all(axis=1))

@@ -59,7 +59,6 @@ class Tile:
 
     @property
     def voxels(self) -> OccupancyVoxels:
-        """Its observed voxels."""
         return self.tiles.voxels(self.key)
 
 
@@ -168,7 +167,6 @@ class Tiles:
         return join_clouds(PointCloud(**tree, frame="map") for _, tree in found)
 
     def voxels(self, key: TileKey) -> OccupancyVoxels:
-        """Return the observed voxels of a tile, map axes."""
         return self.bounds(key).voxels(self.wide_voxels(key))
 
     def wide_voxels(
@@ -193,12 +191,10 @@ class Tiles:
         return self._chain.changed(key, voxels, inside)
 
     def cloud_in(self, rectangle: Rectangle) -> PointCloud:
-        """Return the points in a rectangle, frame ``map``."""
         clouds = map(self.cloud, self._parts.under(rectangle))
         return join_clouds(cloud.select(rectangle.contains(cloud.xyz)) for cloud in clouds)
 
     def voxels_in(self, rectangle: Rectangle) -> OccupancyVoxels:
-        """Return the voxels with their centres in a rectangle."""
         found = map(self.voxels, self._parts.under(rectangle))
         return join_voxels(map(rectangle.voxels, found), self.resolution_m)
 
@@ -288,7 +284,6 @@ class DriveChain:
         self.drive_of: Int64 = np.zeros(0, np.int64)
 
     def drive(self, numbered: tuple[int, Any]) -> int:
-        """Return the drive of what is numbered by submap."""
         return int(self.drive_of[numbered[0]]) if len(self.drive_of) else 0
 
     def joined(self, key: TileKey, *, note: bool) -> OccupancyPart:

@@ -60,7 +60,6 @@ class _Grid:
 
     @property
     def step_px(self) -> float:
-        """Between neighbours."""
         return float(self.u[1] - self.u[0])
 
 
@@ -172,7 +171,6 @@ def _fit_planes(grid: _Grid, trust: Float64) -> _Grid:
 
 
 def _nearest(point: Int32) -> Int32:
-    """The nearest point (R, C) of each pixel."""
     missing = (point < 0).astype(np.uint8)
     kind = cv2.DIST_LABEL_PIXEL
     label = cv2.distanceTransformWithLabels(missing, cv2.DIST_L2, 3, labelType=kind)[1]
@@ -182,7 +180,6 @@ def _nearest(point: Int32) -> Int32:
 
 
 def _window(values: Float64) -> Float64:
-    """The sum over the window around each pixel."""
     size = (2 * _RADIUS + 1, 2 * _RADIUS + 1)
     border = cv2.BORDER_CONSTANT
     summed = cv2.boxFilter(values, cv2.CV_64F, size, normalize=False, borderType=border)
@@ -368,14 +365,10 @@ def closed_behind(mesh: TriangleMesh, thickness_m: float) -> TriangleMesh:
     Args:
         mesh: A manifold mesh in camera axes, of which a ray meets one triangle at most. Surfaces
             that touch in a vertex have one each, which are moved apart by a part of a pixel.
-        thickness_m: Above 0.
+        thickness_m: Above 0; `MeshingError` if it is lost in the precision of the coordinates.
 
     Returns:
-        A watertight mesh, with unit normals outwards; the vertices behind have the colours of those
-        before them.
-
-    Raises:
-        MeshingError: The thickness is lost in the precision of the coordinates.
+        A watertight mesh, with unit normals outwards; what is behind has the colours before it.
     """
     least_m = _LEAST_THICKNESS * float(mesh.vertices[:, 2].max())
     if thickness_m < least_m:

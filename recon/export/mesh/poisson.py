@@ -165,7 +165,6 @@ def simplified(mesh: TriangleMesh, settings: MeshSettings) -> TriangleMesh:
 
 
 def _nearest(some_xyz: Float32, xyz: Float32) -> Int32:
-    """Return int32 (N,): the nearest point of a cloud to each of some places."""
     return open3d_clouds.nearest(some_xyz, xyz)[0][:, 0]
 
 

@@ -147,7 +147,6 @@ class Drive:
         self._loops.stop()
 
     def finish(self) -> None:
-        """Save what is left of the drive."""
         if not len(self.mapper):
             raise RegistrationError("the source has no frame")
         if len(self.mapper) > self._saved:

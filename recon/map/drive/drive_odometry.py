@@ -42,7 +42,6 @@ class UsedPrior:
     sigmas: Mapping[str, float] = field(default_factory=dict)
 
     def warnings(self) -> list[str]:
-        """Return what the user should know about it."""
         if self.known_from != "assumed":
             return []
         what = "too little motion was seen to tell the axes of the prior"
@@ -134,7 +133,6 @@ def doubt_poses(
 
 
 def _of_frames(known_poses: Trajectory, source: StereoSource) -> Trajectory:
-    """Return the known pose of each frame."""
     lines = source.lines(len(known_poses))
     if lines is None:
         raise RegistrationError(

@@ -63,7 +63,6 @@ class Mapper:
         return len(self.session)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Find the pose of the next frame."""
         with self._stage("odometry"):
             return self._odometry.register(frame)
 

@@ -99,7 +99,6 @@ class MappedSequence:
 
     @cached_property
     def camera(self) -> RectifiedCamera:
-        """The rectified camera."""
         return self.session.camera
 
     @cached_property
@@ -114,7 +113,6 @@ class MappedSequence:
 
     @property
     def health(self) -> tuple[OdometryHealth, ...]:
-        """Health of each pose."""
         return self.session.health
 
     @property
@@ -351,7 +349,6 @@ def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
 
 
 def _depths(disparity: Disparity, camera: RectifiedCamera) -> str:
-    """Return the share of pixels with a match, and their depths."""
     share = f"{100 * float(disparity.measured.mean()):.1f} % of the pixels matched"
     if not disparity.measured.any():
         return share

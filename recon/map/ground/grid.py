@@ -144,7 +144,6 @@ def _heights(voxels: OccupancyVoxels, ground: GroundSurface) -> Float64:
 
 
 def _beside(cells: Bool) -> Bool:
-    """Return the cells of a mask, and those that share a side with one."""
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     return np.asarray(cv2.dilate(cells.astype(np.uint8), cross) > 0)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -47,6 +47,21 @@ class GroundSettings(Settings):
     camera_height_m: float | None = Field(None, ge=0.01, le=100.0)
     """Height of the camera above ground; none = measured. Set it where the ground near the path is
     not seen."""
+
+
+class Raster(NamedTuple):
+    """Square cells seen from above; row 0 has the smallest y."""
+
+    origin_m: tuple[float, float]  # x and y of the outer corner of cell (0, 0)
+    cell_m: float
+    shape: tuple[int, int]  # rows, columns
+
+    def cells_of(self, xy_m: Float64) -> tuple[Int64, Bool]:
+        """Return the flat index of the cell of each place (N, 2), and whether there is one."""
+        column, row = np.floor((xy_m - self.origin_m) / self.cell_m).astype(np.int64).T
+        rows, columns = self.shape
+        inside = (row >= 0) & (column >= 0) & (row < rows) & (column < columns)
+        return row * columns + column, np.asarray(inside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,11 +175,12 @@ class _Field:
         low = np.floor(path[:, :2].min(axis=0) / cell) - rings
         columns, rows = (np.floor(path[:, :2].max(axis=0) / cell) - low + rings + 1).astype(int)
         self.origin = (float(low[0] * cell), float(low[1] * cell))
+        self._raster = Raster(self.origin, cell, (rows, columns))
         self.heights = np.full((rows, columns), np.nan)
         self.measured = np.zeros((rows, columns), dtype=np.bool_)
         self._gap = np.full((rows, columns), np.inf)
         # Mean height of the path in each cell that it crosses; NaN elsewhere.
-        cells, _ = self._cells_of(path)
+        cells, _ = self._raster.cells_of(path[:, :2])
         number = np.bincount(cells, minlength=rows * columns)
         total = np.bincount(cells, weights=path[:, 2], minlength=rows * columns)
         mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
@@ -255,18 +271,10 @@ class _Field:
         if cloud.normals is not None:
             upright = math.cos(math.radians(MAX_TILT_DEG))
             xyz = xyz[cloud.normals[:, 2] >= upright]
-        cells, inside = self._cells_of(xyz)
+        cells, inside = self._raster.cells_of(xyz[:, :2])
         cells, z = cells[inside], xyz[inside, 2]
         reached = self._ring.ravel()[cells] < _BEYOND
         return cells[reached], z[reached]
-
-    def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], Bool]:
-        """Return flat index of the cell of each point, and whether it lies on the field."""
-        rows, columns = self.heights.shape
-        x, y = (np.floor((xyz[:, n] - self.origin[n]) / self.cell_m) for n in range(2))
-        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-        column, row = np.where(inside, (x, y), 0).astype(np.intp)
-        return row * columns + column, np.asarray(inside)
 
 
 def _densify(path: Float64, step_m: float) -> Float64:

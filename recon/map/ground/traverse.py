@@ -21,7 +21,7 @@ from recon.core.geometry.se3 import apply
 from recon.core.settings import Settings
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Bool, Float64, Int64
-from recon.map.ground.surface import GroundSurface
+from recon.map.ground.surface import GroundSurface, Raster
 
 UNSURE: Final = -2
 """A cell that was seen, but not well enough to tell whether a robot can drive there."""
@@ -60,24 +60,8 @@ class RobotSettings(Settings):
 
     @property
     def step_m(self) -> float:
-        """The highest step."""
         share = 2 * FRICTION**2 / (1 + FRICTION**2)
         return share * self.wheel_radius_m if self.max_step_m is None else self.max_step_m
-
-
-class Raster(NamedTuple):
-    """Square cells seen from above; row 0 has the smallest y."""
-
-    origin_m: tuple[float, float]  # x and y of the outer corner of cell (0, 0)
-    cell_m: float
-    shape: tuple[int, int]  # rows, columns
-
-    def cells_of(self, xy_m: Float64) -> tuple[Int64, Bool]:
-        """Return the flat index of the cell of each place (N, 2), and whether there is one."""
-        column, row = np.floor((xy_m - self.origin_m) / self.cell_m).astype(np.int64).T
-        rows, columns = self.shape
-        inside = (row >= 0) & (column >= 0) & (row < rows) & (column < columns)
-        return row * columns + column, np.asarray(inside)
 
 
 @dataclass(frozen=True, eq=False)

@@ -303,6 +303,5 @@ def _keys(xyz: Float64, edge_m: float) -> Int64:
 
 
 def _sums(cell: Int64, values: Float64, cells: int) -> Float64:
-    """Sum of the rows of ``values`` in each cell."""
     columns = [np.bincount(cell, weights=column, minlength=cells) for column in values.T]
     return np.stack(columns, axis=1)

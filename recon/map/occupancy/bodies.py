@@ -232,7 +232,6 @@ class _Wanted(NamedTuple):
         return cls(blocks_of(keys), row, column)
 
     def seen_by(self, rays: Rays) -> Int8:
-        """Return what the rays of one frame did to the cells."""
         self.blocks.values[:] = 0
         cast_rays_into(self.blocks, rays, SPREAD_SIGMAS)
         return np.sign(self.blocks.values[self.row, self.column]).astype(np.int8)

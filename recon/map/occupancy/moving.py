@@ -217,7 +217,5 @@ def looked_through(points: Float32, voxels: OccupancyVoxels) -> Bool:
     _, through = find_keys(pack_keys(cells), np.sort(keys[voxels.log_odds <= 0]))
     occupied = np.sort(keys[voxels.log_odds > 0])
     rows = np.flatnonzero(through)
-    for step in product((-1, 0, 1), repeat=3):
-        _, near = find_keys(pack_keys(cells[rows] + np.array(step)), occupied)
-        through[rows[near]] = False
+    through[rows] = _touching(pack_keys(cells[rows]), occupied, _AROUND) == 0
     return through

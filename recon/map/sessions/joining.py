@@ -284,9 +284,9 @@ def _solve(
         for one, T in zip(sessions, places.values(), strict=True)
     ]
     loops = [
-        Tie((place, place), Loop(**loop))
+        Tie((place, place), loop)
         for place, session in enumerate(sessions)
-        for loop in session.loops.get("closed", ())
+        for loop in session.closed
     ]
     ties = [
         Tie((numbers.index(link.sessions[0]), numbers.index(link.sessions[1])), link.loop)

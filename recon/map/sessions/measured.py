@@ -379,7 +379,6 @@ def span_m(positions: Float64) -> float:
 
 
 def _during(path: Trajectory, times_s: Float64) -> Bool:
-    """Return bool (N,): times between two frames of a path that follow each other."""
     frames_s = path.timestamps_s
     inside = (times_s >= frames_s[0]) & (times_s <= frames_s[-1])
     near_s = np.abs(frames_s[nearest_sorted(times_s, frames_s)] - times_s)

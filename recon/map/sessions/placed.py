@@ -134,7 +134,6 @@ class PlacedSubmaps:
         return sum(self.drives)
 
     def __iter__(self) -> Iterator[Submap]:
-        """Return the submaps in order, read one at a time."""
         return map(self.__getitem__, range(len(self)))
 
     def __getitem__(self, number: int) -> Submap:

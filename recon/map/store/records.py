@@ -90,7 +90,6 @@ def _closed_on_error(database: sqlite3.Connection) -> Iterator[sqlite3.Connectio
 
 
 def _make_tables(database: sqlite3.Connection) -> None:
-    """Make an empty file a store."""
     # Most records are larger than any page: fewer pages are written faster.
     database.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
     database.execute("BEGIN")
@@ -145,7 +144,6 @@ class _Content:
             self._file = BytesIO(database.execute(query, (row,)).fetchone()[0])
 
     def read(self, size: int) -> bytearray:
-        """Return the next bytes, exactly as many."""
         if not 0 <= size <= self.left:
             raise FormatError("a record of the map is truncated")
         self.left -= size
@@ -195,7 +193,6 @@ class Store:
 
     @classmethod
     def open(cls, path: Path, *, read_only: bool = False, cache_bytes: int = CACHE_BYTES) -> Self:
-        """Open a store at its last commit."""
         with reading(path):
             with path.open("rb"):  # a missing file, a folder, no permission
                 pass
@@ -396,7 +393,6 @@ class Cache:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the kept values take."""
         return self._size
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:

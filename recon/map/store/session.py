@@ -39,6 +39,7 @@ from recon.places.closure import Closure
 from recon.places.detector import StoredKeyframe
 from recon.places.fixes import NO_FIXES, Fixes
 from recon.places.keyframe import Keyframe
+from recon.places.loop import Loop
 
 SESSION: Final = "session"
 AXES: Final = "axes"
@@ -84,7 +85,7 @@ class Session:
             for name in (BENT, ALONE):
                 if (poses := self.loops.get(name)) is not None:
                     path_of(poses, np.array(self._times_s))
-            for loop in map(loop_in, self.loops.get("closed", ())):
+            for loop in self.closed:
                 if not 0 <= loop.first < loop.last < len(self):
                     raise FormatError("a loop of the map is not between two frames", got=f"{loop}")
         self.submaps = Submaps(store, number)
@@ -158,6 +159,11 @@ class Session:
         if not self._store.has(LOOPS, self.number):
             return {}
         return self._store.get(LOOPS, self.number)
+
+    @property
+    def closed(self) -> tuple[Loop, ...]:
+        """The loops that were closed."""
+        return tuple(map(loop_in, self.loops.get("closed", ())))
 
     def corrections(self) -> Float64 | None:
         """Return float64 (S, 4, 4), by what loops move each submap; None = nothing moves."""

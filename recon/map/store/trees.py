@@ -188,7 +188,6 @@ def _part(kind: Any, name: str, part: Any) -> Any:
 
 @lru_cache
 def _adapters(kind: Any) -> dict[str, TypeAdapter[Any]]:
-    """Return what checks each field that is no array."""
     hints = get_type_hints(kind)
     plain = (one.name for one in fields(kind) if get_origin(hints[one.name]) is not np.ndarray)
     return {name: TypeAdapter(hints[name]) for name in plain}

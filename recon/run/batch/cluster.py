@@ -58,7 +58,6 @@ class BatchOptions:
     fail_fast: bool = False
 
     def connect(self) -> AbstractContextManager[Cluster]:
-        """Return the workers, for ``with``."""
         if self.scheduler is not None:
             return join_cluster(self.scheduler)
         return local_cluster(self.workers or available_cores())

@@ -151,7 +151,6 @@ def name_of_swept(name: str, swept: Mapping[str, Any]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text as part of the name of a folder."""
     return re.sub(r"[^A-Za-z0-9_.+-]", "-", text)
 
 

@@ -71,7 +71,6 @@ class JobResult:
 
     @property
     def seconds(self) -> float:
-        """Time of its last try."""
         return self.last.seconds
 
     @property
