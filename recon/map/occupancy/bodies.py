@@ -18,10 +18,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import product
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from recon.core.geometry.se3 import apply, invert
@@ -33,8 +34,6 @@ from recon.map.kernels.looks import count_look, rays_towards
 from recon.map.kernels.raycast import (
     BLOCK_BITS,
     BLOCK_EDGE,
-    Blocks,
-    Rays,
     blocks_of,
     cast_rays_into,
 )
@@ -54,20 +53,6 @@ _HALF: Final = np.array([s for s in product((-1, 0, 1), repeat=3) if s > (0, 0, 
 """Steps to one of each two opposite neighbours."""
 
 
-class _Seen(NamedTuple):
-    """What all frames saw: of each cell (N,), and of each pair (P,); int64.
-
-    ``hit`` and ``through`` count frames, ``runs`` how often hits began; ``both`` counts frames that
-    saw both cells of a pair, ``differed`` those that hit one and looked through the other.
-    """
-
-    hit: Int64
-    through: Int64
-    runs: Int64
-    both: Int64
-    differed: Int64
-
-
 def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
     """Return bool (N,), the cells of pieces of surface that were there at one time only.
 
@@ -80,9 +65,28 @@ def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
     of_pairs = np.zeros((2, len(pairs)), np.int64)
     for look in looks:
         count_look(look, before, of_cells, pairs, of_pairs)
-    seen = _Seen(*of_cells, *of_pairs)
+    # How often frames hit each cell, looked through it, and began to hit it; by how many pairs of
+    # cells were both seen, and by how many seen differently.
+    (hit, through, runs), (both, differed) = of_cells, of_pairs
+    one, other = (hit / np.maximum(hit + through, 1))[pairs].T
+    by_chance = both * (one * (1 - other) + other * (1 - one))
     piece = pieces_of(len(keys), pairs)
-    ratio = _disagreement(seen, pairs, upright, placed, piece)[piece]
+    home, pieces = piece[pairs[:, 0]], int(piece.max(initial=-1)) + 1
+
+    def disagreement(which: Bool) -> Float64:
+        """Return that of each piece, of all and of upright pairs; NaN where too little is known."""
+        ratios = []
+        for some in (which, which & upright):
+            found = np.bincount(home[some], differed[some], pieces)
+            expected = np.bincount(home[some], by_chance[some], pieces)
+            out = np.full(pieces, np.nan)
+            ratios.append(np.divide(found, expected, out=out, where=np.asarray(expected > 0)))
+        return np.asarray(np.hypot(*ratios) / np.sqrt(2.0))
+
+    # Cells whose points were not placed count where a piece has no others.
+    surely = disagreement(np.asarray(placed[pairs].all(axis=1)))
+    at_all = disagreement(np.ones(len(pairs), np.bool_))
+    ratio = np.where(np.isfinite(surely), surely, at_all)[piece]
     known = np.isfinite(ratio)
     body = known & (ratio <= _DISAGREEMENT)
     for _ in range(_GAPS):
@@ -91,7 +95,7 @@ def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
             near |= find_keys(keys + stride, among)[1]
         body |= ~known & near
     # A few cells alone: hit in one run of frames, and looked through before or after.
-    alone = (seen.runs == 1) & (seen.through >= _LEAST_LOOKS)
+    alone = (runs == 1) & (through >= _LEAST_LOOKS)
     return np.asarray(body | (~known & alone))
 
 
@@ -106,41 +110,10 @@ def pairs_of(keys: Int64) -> tuple[Int64, Bool]:
     return np.concatenate(found), np.concatenate(upright)
 
 
-def _disagreement(seen: _Seen, pairs: Int64, upright: Bool, placed: Bool, piece: Int64) -> Float64:
-    """Return float64, the disagreement in each piece; NaN where too little is known.
-
-    Cells whose points were not placed count where a piece has no others.
-    """
-    rate = seen.hit / np.maximum(seen.hit + seen.through, 1)
-    one, other = rate[pairs].T
-    by_chance = seen.both * (one * (1 - other) + other * (1 - one))
-    home, pieces = piece[pairs[:, 0]], int(piece.max(initial=-1)) + 1
-
-    def ratio(which: Bool) -> Float64:
-        differed = np.bincount(home[which], seen.differed[which], pieces)
-        expected = np.bincount(home[which], by_chance[which], pieces)
-        out = np.full(pieces, np.nan)
-        np.divide(differed, expected, out=out, where=np.asarray(expected > 0))
-        return out
-
-    def of(which: Bool) -> Float64:
-        return np.asarray(np.hypot(ratio(which), ratio(which & upright)) / np.sqrt(2.0))
-
-    surely, at_all = of(np.asarray(placed[pairs].all(axis=1))), of(np.ones(len(pairs), np.bool_))
-    return np.where(np.isfinite(surely), surely, at_all)
-
-
 def pieces_of(cells: int, pairs: Int64) -> Int64:
     """Return int64 (N,), number of the piece of each cell: cells that touch are of one."""
-    label = np.arange(cells)
-    while True:
-        least = label.copy()
-        for one, other in (pairs.T, pairs.T[::-1]):
-            np.minimum.at(least, one, label[other])
-        least = least[least]
-        if np.array_equal(least, label):
-            return np.unique(label, return_inverse=True)[1]
-        label = least
+    graph = coo_matrix((np.ones(len(pairs), np.bool_), pairs.T), (cells, cells))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
 def strides(steps: Int64) -> Int64:
@@ -179,7 +152,10 @@ class Looks:
         cells = unpack_keys(keys).astype(np.int64)
         centres = (cells + 0.5) * self.settings.resolution_m
         reach_m = self.settings.max_range_m + self.settings.resolution_m
-        wanted = _Wanted.of(cells)
+        # No cells are kept of a frame but those that are looked at, as places in blocks.
+        homes, row = np.unique(pack_keys(cells >> BLOCK_BITS), return_inverse=True)
+        column = np.ravel_multi_index(tuple((cells % BLOCK_EDGE).T), (BLOCK_EDGE,) * 3)
+        blocks = blocks_of(homes)
         for frame in self._near(centres.min(axis=0), centres.max(axis=0), reach_m).tolist():
             T = self.T_map_camera[frame]
             ahead = apply(invert(T), centres)
@@ -188,7 +164,9 @@ class Looks:
                 cloud = self._read(frame).cloud()
                 chosen = rays_towards(cloud.xyz, ahead[seen], self.settings.resolution_m)
                 rays = frame_rays(cloud.select(chosen), T, self.settings)
-                yield frame, wanted.seen_by(rays)
+                blocks.values[:] = 0
+                cast_rays_into(blocks, rays, SPREAD_SIGMAS)
+                yield frame, np.sign(blocks.values[row, column]).astype(np.int8)
 
     @cached_property
     def finest(self) -> Looks:
@@ -216,25 +194,6 @@ class Looks:
         """Return the frames from which something between two corners may be in reach."""
         places = self.T_map_camera[:, : len(low), 3]
         return np.flatnonzero(((places > low - reach_m) & (places < high + reach_m)).all(axis=1))
-
-
-class _Wanted(NamedTuple):
-    """Cells (N,) that are looked at, as places in blocks; no others are kept of a frame."""
-
-    blocks: Blocks
-    row: NDArray[np.intp]
-    column: NDArray[np.intp]
-
-    @classmethod
-    def of(cls, cells: Int64) -> _Wanted:
-        keys, row = np.unique(pack_keys(cells >> BLOCK_BITS), return_inverse=True)
-        column = np.ravel_multi_index(tuple((cells % BLOCK_EDGE).T), (BLOCK_EDGE,) * 3)
-        return cls(blocks_of(keys), row, column)
-
-    def seen_by(self, rays: Rays) -> Int8:
-        self.blocks.values[:] = 0
-        cast_rays_into(self.blocks, rays, SPREAD_SIGMAS)
-        return np.sign(self.blocks.values[self.row, self.column]).astype(np.int8)
 
 
 _PAIRS: Final = 24  # of frames, from all over a map, that are compared

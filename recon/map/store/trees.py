@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
-from typing import Any, Final, NamedTuple, TypeVar, get_origin, get_type_hints
+from typing import Any, Final, TypeVar, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,36 +92,26 @@ def from_bytes(text: str, read: Callable[[int], bytearray], most: int) -> dict[s
         if not isinstance(value, dict):
             return value
         if _ARRAY in value:
-            *head, begin, end = value[_ARRAY]
+            name, shape, layout, codec, begin, end = value[_ARRAY]
             if begin != position:
                 raise FormatError("the arrays of a record of the map are not in order")
             position = end
-            claim = _Claim(np.dtype(head[0]), *head[1:])
-            left -= claim.nbytes if claim.codec == _ZLIB else 0
+            dtype = np.dtype(name)
+            if dtype.kind not in _KINDS or min(shape, default=0) < 0:
+                raise FormatError("an array of the map has an impossible type or shape")
+            left -= math.prod(shape) * dtype.itemsize if codec == _ZLIB else 0
             if left < 0:
                 raise FormatError("a record of the map claims more than it can hold")
-            return _unpack(claim, read(end - begin))
+            array = _unpack(
+                read(end - begin), dtype, shape[::-1] if layout == "F" else shape, codec
+            )
+            return array.T if layout == "F" else array
         return {name: restored(item) for name, item in value[_TREE].items()}
 
     tree = restored(json.loads(text))
     if not isinstance(tree, dict):
         raise FormatError("a record of the map is no tree")
     return tree
-
-
-class _Claim(NamedTuple):
-    """What a record says of an array, before anything is made of it."""
-
-    dtype: np.dtype[Any]
-    shape: list[int]
-    layout: str
-    codec: str
-
-    @property
-    def nbytes(self) -> int:
-        if self.dtype.kind not in _KINDS or min(self.shape, default=0) < 0:
-            raise FormatError("an array of the map has an impossible type or shape")
-        return math.prod(self.shape) * self.dtype.itemsize
 
 
 def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | memoryview]:
@@ -144,21 +134,19 @@ def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | me
     return [little.dtype.str, list(array.shape), layout, codec], content
 
 
-def _unpack(claim: _Claim, packed: bytearray) -> NDArray[Any]:
+def _unpack(packed: bytearray, dtype: np.dtype[Any], shape: list[int], codec: str) -> NDArray[Any]:
     """Return the array of these bytes, which it takes over where they are not compressed."""
-    dtype, shape, layout, codec = claim
-    axes = shape[::-1] if layout == "F" else shape
+    nbytes = math.prod(shape) * dtype.itemsize
     content: bytes | bytearray = packed  # compiled kernels take only arrays that can be written
     if codec == _ZLIB:
-        content = zlib.decompressobj().decompress(packed, claim.nbytes + 1)
-    if len(content) != claim.nbytes:
+        content = zlib.decompressobj().decompress(packed, nbytes + 1)
+    if len(content) != nbytes:
         raise FormatError("an array of the map is truncated")
     numbers: NDArray[Any] = np.frombuffer(content, np.uint8)
     if codec == _ZLIB:
-        planes = numbers.reshape(_columns(axes), dtype.itemsize, -1).transpose(2, 0, 1)
+        planes = numbers.reshape(_columns(shape), dtype.itemsize, -1).transpose(2, 0, 1)
         numbers = np.array(planes, order="C").reshape(-1)
-    array: NDArray[Any] = numbers.view(dtype).reshape(axes)
-    return array.T if layout == "F" else array
+    return numbers.view(dtype).reshape(shape)
 
 
 def _columns(shape: Sequence[int]) -> int:
