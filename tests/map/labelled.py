@@ -61,7 +61,7 @@ def main(folder: Path) -> None:
     from recon.io.models.ply import read_ply, write_ply
     from recon.io.models.ros_bag import header, points
     from recon.map.map import Map
-    from recon.map.sessions.placed import keep_map
+    from recon.map.sessions.copying import keep_map
     from recon.stereo.frame import voxel_downsample
     from recon.view.scene import COLOURINGS, Points, colours
     from tests.map import walls

@@ -16,7 +16,7 @@ from recon.core.errors import FormatError, ShapeError
 from recon.core.values import ATTRIBUTES, Attribute, PointCloud
 from recon.io.models.columns import columns_of
 from recon.map.map import Map
-from recon.map.sessions.placed import keep_map
+from recon.map.sessions.copying import keep_map
 from tests.map import walls
 
 LABEL = Attribute("label", np.uint8, fused="vote", values=4)

@@ -1,10 +1,11 @@
-"""Drives that go from one map into another: as drives of their own, or as one after the other."""
+"""Drives that go from one map into another, or into one file that is kept, also piece by piece."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from itertools import chain
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -14,12 +15,14 @@ from recon.core.geometry.se3 import orthonormalise
 from recon.core.text import counted
 from recon.core.values.arrays import Float64
 from recon.map.builders import Submap
+from recon.map.kernels import clamped
+from recon.map.occupancy.part import OccupancyPart
 from recon.map.sessions.joining import T_one_other, link_by_frame
 from recon.map.sessions.placed import check_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
 from recon.map.store.records import Key
-from recon.map.store.session import AXES, ENTRY, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
+from recon.map.store.session import AXES, ENTRY, IMAGES, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
 from recon.map.store.trees import FRAMES, RAYS, RIG
 from recon.odometry.health import stretches
 from recon.places.detector import LoopDetector, StoredKeyframe
@@ -103,6 +106,24 @@ def join_parts(
                 keyframe = replace(stored.keyframe, frame=frame)
                 pose, along_m = poses[frame], float(path_m[frame])
                 detector.look(StoredKeyframe(keyframe, pose, along_m, int(stretch[frame])))
+
+
+def keep_map(mapped: MapFile, path: Path) -> None:
+    """Write the map of finished drives, but for occupancy, which is made of rays again."""
+    blocks, starts, cells = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint16)
+    nothing = OccupancyPart(clamped.CellRows(blocks, starts, cells, np.zeros((0, 3), np.float32)))
+    with MapFile.create(path) as kept:
+        for session in mapped.sessions:
+            start = {name: kept_ for name, kept_ in session.info.start.items() if name == IMAGES}
+            new = kept.begin(replace(session.info, start=start))
+            for number, T_world_camera in enumerate(session.odometry.T_world_camera):
+                time_s = float(session.odometry.timestamps_s[number])
+                new.add_frame(T_world_camera, time_s, session.health[number])
+            for submap in session.submaps:
+                new.submaps.add(replace(submap, occupancy=nothing), compress=True)
+        for kind in (AXES, RIG, LOOPS, KEYFRAME, RAYS):
+            mapped.store.copy(kind, kept.store)
+        kept.commit()
 
 
 def read_all(map_: MapFile) -> None:

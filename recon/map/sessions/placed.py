@@ -25,15 +25,12 @@ from recon.core.work import side_by_side
 from recon.io.files import resolved
 from recon.map.builders import OccupancyBuilder, Submap
 from recon.map.cut import Cutter, TileKey, TileParts
-from recon.map.kernels import clamped
 from recon.map.occupancy.bodies import Looks
-from recon.map.occupancy.part import OccupancyPart
 from recon.map.sessions.joining import seen_before
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
 from recon.map.store.records import Store
-from recon.map.store.session import AXES, IMAGES, KEYFRAME, LOOPS, Session, Submaps
-from recon.map.store.trees import RAYS, RIG
+from recon.map.store.session import Session, Submaps
 from recon.map.tiles import Tiles
 
 Each = Callable[[Callable[[Any], None], Sequence[Any]], None]
@@ -337,24 +334,3 @@ def check_rays(session: Session, settings: DriveSettings) -> None:
             expected=f"at most {grain.max_range_m:g} m",
             hint="map the drive again with --set occupancy.max_range_m=",
         )
-
-
-def keep_map(mapped: MapFile, path: Path) -> None:
-    """Write the map of finished drives, but for occupancy, which is made of rays again."""
-    with MapFile.create(path) as kept:
-        for session in mapped.sessions:
-            start = {name: kept_ for name, kept_ in session.info.start.items() if name == IMAGES}
-            new = kept.begin(replace(session.info, start=start))
-            for number, T_world_camera in enumerate(session.odometry.T_world_camera):
-                time_s = float(session.odometry.timestamps_s[number])
-                new.add_frame(T_world_camera, time_s, session.health[number])
-            for submap in session.submaps:
-                new.submaps.add(replace(submap, occupancy=_nothing()), compress=True)
-        for kind in (AXES, RIG, LOOPS, KEYFRAME, RAYS):
-            mapped.store.copy(kind, kept.store)
-        kept.commit()
-
-
-def _nothing() -> OccupancyPart:
-    blocks, starts, cells = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint16)
-    return OccupancyPart(clamped.CellRows(blocks, starts, cells, np.zeros((0, 3), np.float32)))
