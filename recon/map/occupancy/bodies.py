@@ -65,8 +65,8 @@ def came_or_went(keys: Int64, placed: Bool, looks: Iterable[Int8]) -> Bool:
     of_pairs = np.zeros((2, len(pairs)), np.int64)
     for look in looks:
         count_look(look, before, of_cells, pairs, of_pairs)
-    # How often frames hit each cell, looked through it, and began to hit it; how often they saw both
-    # cells of a pair, and saw them differently.
+    # How often frames hit each cell, looked through it, and began to hit it; how often they saw
+    # both cells of a pair, and saw them differently.
     (hit, through, runs), (both, differed) = of_cells, of_pairs
     one, other = (hit / np.maximum(hit + through, 1))[pairs].T
     by_chance = both * (one * (1 - other) + other * (1 - one))
