@@ -98,7 +98,13 @@ class Flattening:
         if self._tiles.extent[0] == self._tiles.extent[1]:
             raise MappingError("nothing was observed: there is no map to flatten")
         settings, driven = self._along_the_path()
-        low, high = self._extent()
+        low, high = self._tiles.extent
+        path_m = self._path_m[self._trusted, :2]
+        if len(path_m):
+            first = np.floor((path_m.min(axis=0) - self._margin_m) / self._resolution_m)
+            last = np.ceil((path_m.max(axis=0) + self._margin_m) / self._resolution_m)
+            low = (min(low[0], int(first[0])), min(low[1], int(first[1])))
+            high = (max(high[0], int(last[0])), max(high[1], int(last[1])))
         shape = (high[1] - low[1], high[0] - low[0])
         if math.prod(shape) > _MOST_CELLS:
             got, expected = f"{shape[1]} x {shape[0]} cells", f"at most {_MOST_CELLS:g} cells"
@@ -151,17 +157,6 @@ class Flattening:
                 f"{settings.max_height_m:g} m, is thinner than a voxel of {cell_m:g} m: obstacles "
                 "fall through; widen it, or take smaller cells"
             )
-
-    def _extent(self) -> tuple[TileKey, TileKey]:
-        """Return the smallest x and y of the cells, and the largest ones plus one."""
-        low, high = self._tiles.extent
-        path_m = self._path_m[self._trusted, :2]
-        if not len(path_m):
-            return low, high
-        first = np.floor((path_m.min(axis=0) - self._margin_m) / self._resolution_m)
-        last = np.ceil((path_m.max(axis=0) + self._margin_m) / self._resolution_m)
-        low, high = np.minimum(low, first).astype(int), np.maximum(high, last).astype(int)
-        return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
 
     def _flat(
         self, key: TileKey, settings: GroundSettings, path: DrivenPath | None

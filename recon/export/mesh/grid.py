@@ -88,9 +88,17 @@ def mesh_grid(cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings
     off = (grid.disparity - first.disparity) / first.sigma
     grid = _fit_planes(grid, np.asarray(1 / (1 + off**2)))
     edges = _edges(grid)
-    pixels = _whole(_triangles(_errors(grid, edges)), grid, edges)
-    place, faces = _manifold(pixels, settings.min_component_faces, grid.point.shape[1])
-    row, column = np.divmod(place, grid.point.shape[1])
+    pixels, width = _triangles(_errors(grid, edges)), grid.point.shape[1]
+    # Those with points at their corners, and no edge or change between them.
+    pixels = pixels[np.ptp(grid.changes.ravel()[pixels], axis=1) <= 1]  # NaN without a point
+    right = np.pad(edges[0], ((0, 0), (0, 1))).ravel()
+    down = np.pad(edges[1], ((0, 1), (0, 0))).ravel()
+    kept = np.ones(len(pixels), np.bool_)
+    for end in pixels.T[:2]:
+        low, way = np.minimum(end, pixels[:, 2]), np.abs(end - pixels[:, 2])
+        kept &= ~((way == 1) & right[low]) & ~((way == width) & down[low])
+    place, faces = _manifold(pixels[kept], settings.min_component_faces, width)
+    row, column = np.divmod(place, width)
     z = camera.focal_px * camera.baseline_m / grid.disparity[row, column]
     x, y = (k * z / camera.focal_px for k in (grid.u[column], grid.v[row]))
     vertices = np.stack([x, y, z], axis=1).astype(np.float32)
@@ -212,7 +220,14 @@ def _errors(grid: _Grid, edges: tuple[Bool, Bool]) -> Float64:
     off in one of the parts counts for the whole. It is always split where the depth changes too
     much within.
     """
-    error = np.where(_torn(grid.valid, edges), np.inf, 0.0)
+    # Beside an edge of a surface triangles must be smallest; they have diagonal sides, too.
+    valid, torn = grid.valid, np.zeros(grid.valid.shape, np.uint8)
+    right, down = edges[0] & (valid[:, :-1] | valid[:, 1:]), edges[1] & (valid[:-1] | valid[1:])
+    torn[:, :-1] |= right
+    torn[:, 1:] |= right
+    torn[:-1] |= down
+    torn[1:] |= down
+    error = np.where(cv2.dilate(torn, np.ones((3, 3), np.uint8)) > 0, np.inf, 0.0)
     size = 2
     while size <= _SQUARE:
         for view in (np.asarray, np.transpose):
@@ -223,18 +238,6 @@ def _errors(grid: _Grid, edges: tuple[Bool, Bool]) -> Float64:
         error[size // 2 :: size, size // 2 :: size][_span(corners) > 1] = np.inf
         size *= 2
     return error
-
-
-def _torn(valid: Bool, edges: tuple[Bool, Bool]) -> Bool:
-    """Return bool (R, C): pixels beside an edge of a surface, whose triangles must be smallest."""
-    right, down = edges[0] & (valid[:, :-1] | valid[:, 1:]), edges[1] & (valid[:-1] | valid[1:])
-    torn = np.zeros(valid.shape, np.uint8)
-    torn[:, :-1] |= right
-    torn[:, 1:] |= right
-    torn[:-1] |= down
-    torn[1:] |= down
-    # Triangles have diagonal sides, too.
-    return np.asarray(cv2.dilate(torn, np.ones((3, 3), np.uint8)) > 0)
 
 
 def _add_sides(error: Float64, d: Float64, sigma: Float64, size: int) -> None:
@@ -307,19 +310,6 @@ def _triangles(error: Float64) -> Int64:
         halves = ([corner, first, middle], [last, corner, middle])
         open_ = np.concatenate([np.stack(half) for half in halves], axis=1)
     return np.asarray(np.concatenate([*done, open_], axis=1).T, np.int64)
-
-
-def _whole(faces: Int64, grid: _Grid, edges: tuple[Bool, Bool]) -> Int64:
-    """The triangles (F, 3) with points at their corners, and no edge or change between them."""
-    faces = faces[np.ptp(grid.changes.ravel()[faces], axis=1) <= 1]  # NaN without a point
-    width = grid.point.shape[1]
-    right = np.pad(edges[0], ((0, 0), (0, 1))).ravel()
-    down = np.pad(edges[1], ((0, 1), (0, 0))).ravel()
-    kept = np.ones(len(faces), np.bool_)
-    for end in faces.T[:2]:
-        low, way = np.minimum(end, faces[:, 2]), np.abs(end - faces[:, 2])
-        kept &= ~((way == 1) & right[low]) & ~((way == width) & down[low])
-    return faces[kept]
 
 
 def _manifold(faces: Int64, least: int, width: int) -> tuple[Int64, Int32]:

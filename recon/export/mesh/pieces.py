@@ -18,7 +18,7 @@ from recon.core.machine import available_cores
 from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values import TriangleMesh
-from recon.core.values.arrays import Bool, Float32, Int32, Int64
+from recon.core.values.arrays import Float32, Int32, Int64
 from recon.core.work import side_by_side
 from recon.export.cloud import export_cloud
 from recon.export.mesh.cut import (
@@ -183,8 +183,15 @@ class _Mesher:
         large = (np.bincount(whole, sizes) >= least)[whole]
         ends = np.cumsum([*map(len, self.sizes)], dtype=np.int64)
         kept = np.split(large, ends)[: len(paths)]
-        pieces = [_without_crumbs(*each) for each in zip(paths, kept, strict=True)]
-        return [piece for piece in pieces if piece.faces], self._warnings(failed)
+        pieces = []
+        for path, own in zip(paths, kept, strict=True):
+            mesh = read_mesh(path)
+            if not own.all():  # it is written again, if anything is left
+                mesh = with_faces(mesh, mesh.faces[own[component_labels(mesh.faces)[0]]])
+                write_mesh(path, mesh) if len(mesh.faces) else path.unlink()
+            if len(mesh.faces):
+                pieces.append(MeshPiece(path, len(mesh.vertices), len(mesh.faces)))
+        return pieces, self._warnings(failed)
 
     def _warnings(self, failed: dict[PieceKey, MeshingError]) -> list[str]:
         """Return a line about the pieces without a surface, naming the one with the most points."""
@@ -259,19 +266,6 @@ class _Mesher:
     def _plane(self, key: PieceKey, axis: int, far: int) -> Plane:
         sides = self._bounds(key)
         return Plane(axis, (sides.high if far else sides.low)[axis])
-
-
-def _without_crumbs(path: Path, kept: Bool) -> MeshPiece:
-    """Write a piece again without some of its components, if not all are kept; none: no file."""
-    mesh = read_mesh(path)
-    labels, _ = component_labels(mesh.faces)
-    if not kept.all():
-        mesh = with_faces(mesh, mesh.faces[kept[labels]])
-        if len(mesh.faces):
-            write_mesh(path, mesh)
-        else:
-            path.unlink()
-    return MeshPiece(path, len(mesh.vertices), len(mesh.faces))
 
 
 _ROUND_M: Final = 100.0

@@ -74,7 +74,7 @@ class Drive:
             if len(self.session):
                 path, health = self.session.odometry, self.session.health
                 self._loops.restore(path.T_world_camera, stretches(health))
-            self._saved = len(self.mapper)
+            self._saved, self._last = len(self.mapper), time.perf_counter()
             self._start = self._last - state["seconds"]
 
     def begin_at(self, frame: int) -> None:

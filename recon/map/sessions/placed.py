@@ -7,7 +7,7 @@ comes of it is what one process makes: parts are numbered by submap, and joined 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -62,8 +62,14 @@ def place_map(map_: MapFile, settings: DriveSettings, threads: int = 1) -> Place
     from its rays, of so many submaps at a time. A map without rays has a cloud, and no occupancy.
     """
     placed = PlacedSubmaps(map_, settings)
+    submaps: Iterable[Submap] = placed
+    if not placed.ready:
+        # They may be cut several times, and are slow to make: once, into a temporary store.
+        submaps = made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
+        for submap in side_by_side(placed.__getitem__, range(len(placed)), threads=threads):
+            made.add(replace(submap, index=len(made), first_frame=made.frames))
     tiles = Tiles.of_submaps(
-        placed if placed.ready else _made_once(placed, settings, threads),
+        submaps,
         settings,
         map_.first.T_map_world,
         placed.corrections,
@@ -161,14 +167,6 @@ def _to_be_cast(session: Session, settings: DriveSettings) -> bool:
         return session.ray_frames > 0
     made, wanted = settings_of(session).occupancy, settings.occupancy
     return made.model_copy(update={"keep_rays": wanted.keep_rays}) != wanted
-
-
-def _made_once(placed: PlacedSubmaps, settings: DriveSettings, threads: int) -> Submaps:
-    """Return submaps that may be cut several times, and are slow to make, in a temporary store."""
-    made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
-    for submap in side_by_side(placed.__getitem__, range(len(placed)), threads=threads):
-        made.add(replace(submap, index=len(made), first_frame=made.frames))
-    return made
 
 
 def _beside(

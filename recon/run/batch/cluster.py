@@ -132,7 +132,12 @@ class Cluster:
         self, jobs: list[Job], folder: str, workers: Sequence[str]
     ) -> Iterator[tuple[Job, Any]]:
         """Give jobs to Dask, all with the same needs in one message."""
-        declared = self._declared() if any(job.needs for job in jobs) else ()
+        declared: frozenset[str] = frozenset()  # what all workers do
+        if any(job.needs for job in jobs):
+            with _reaching():
+                workers_now = self._client.scheduler_info(n_workers=-1)["workers"].values()
+            names = [frozenset(worker["resources"]) for worker in workers_now]
+            declared = frozenset.intersection(*names) if names else declared
         groups: dict[tuple[tuple[str, float], ...], list[Job]] = {}
         for job in jobs:
             needs = tuple((name, job.needs[name]) for name in declared if name in job.needs)
@@ -149,12 +154,6 @@ class Cluster:
                 allow_other_workers=bool(workers),  # where these die, too
             )
             yield from zip(alike, futures, strict=True)
-
-    def _declared(self) -> frozenset[str]:
-        with _reaching():
-            workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        names = [frozenset(worker["resources"]) for worker in workers.values()]
-        return frozenset.intersection(*names) if names else frozenset()
 
 
 @contextmanager
