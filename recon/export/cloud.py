@@ -18,12 +18,11 @@ from recon.export.occupancy import GROUND_SHARE, Flattening
 from recon.export.product import Made, Order
 from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
-from recon.io.models.las import AreGround, write_las
+from recon.io.models.las import write_las
 from recon.io.models.npz import write_npz
 from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import write_ply_tiles
 from recon.map.ground.surface import MAX_TILT_DEG, WINDOW_M, GroundSurface
-from recon.map.sessions.placed import PlacedMap
 from recon.map.tiles import Tiles
 
 SAMPLE_POINTS: Final = 300_000  # points of the fused cloud that are kept for display
@@ -140,7 +139,17 @@ def las_product(order: Order, path: Path, write: Callable[..., int] = write_las)
     clouds = (tile.cloud for tile in order.placed.tiles)
     # A hundredth of a voxel, as a decimal: a millimetre on a road.
     step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
-    how = {"step_m": step_m, "ground": _ground_of(order.placed)}
+    tiles, known = order.placed.tiles, dict(Flattening(order.placed).grounds())
+
+    def are_ground(cloud: PointCloud) -> Bool:
+        """Return which points of a tile are ground; far from the path, none is known to be."""
+        if not len(cloud):
+            return np.zeros(0, np.bool_)
+        column, row = (cloud.xyz[0, :2] // tiles.edge_m).astype(int).tolist()
+        surface = known.get(tiles.bounds((column, row)))
+        return np.zeros(len(cloud), np.bool_) if surface is None else ground_points(cloud, surface)
+
+    how = {"step_m": step_m, "ground": are_ground}
     return Made({"points": write(path, clouds, order.T_survey_map, order.crs, **how)})
 
 
@@ -153,20 +162,6 @@ def e57_product(order: Order, path: Path) -> Made:
     """Write the cloud as E57, perhaps where a survey says."""
     clouds = (tile.cloud for tile in order.placed.tiles)
     return Made({"points": write_e57(path, clouds, order.T_survey_map, order.crs)})
-
-
-def _ground_of(placed: PlacedMap) -> AreGround:
-    """Return what tells which points of a tile are ground; far from the path, none is known."""
-    tiles, known = placed.tiles, dict(Flattening(placed).grounds())
-
-    def are_ground(cloud: PointCloud) -> Bool:
-        if not len(cloud):
-            return np.zeros(0, np.bool_)
-        column, row = (cloud.xyz[0, :2] // tiles.edge_m).astype(int).tolist()
-        surface = known.get(tiles.bounds((column, row)))
-        return np.zeros(len(cloud), np.bool_) if surface is None else ground_points(cloud, surface)
-
-    return are_ground
 
 
 def ground_points(cloud: PointCloud, surface: GroundSurface) -> Bool:

@@ -165,7 +165,14 @@ class Flattening:
         ground = self._ground(key, settings)
         if ground is None:
             return None
-        passed = {} if path is None else self._passed(key, path, ground)
+        passed: dict[int, OccupancyPart] = {}
+        if path is not None:  # the space that the vehicle took up, by submap
+            area = self._tiles.bounds(key).wider(self._margin_m)
+            path, free = path.select(area.contains(path.points_m)), log_odds(MIN_PROBABILITY)
+            for submap in np.unique(path.submap).tolist():
+                points_m = path.points_m[path.submap == submap]
+                keys = sweep(points_m, ground, self._width_m, self._resolution_m)
+                passed[submap] = free_part(keys, free)
         voxels = self._tiles.wide_voxels(key, passed)
         self._ground_depths.append(ground_depths(voxels, ground))
         if not len(voxels):
@@ -195,18 +202,6 @@ class Flattening:
     def _ground_points(self, area: Rectangle) -> PointCloud:
         """Return points in which ground is looked for: those of the cloud, and floors of voxels."""
         return add_floors(self._tiles.cloud_in(area), self._tiles.floors_in(area))
-
-    def _passed(
-        self, key: TileKey, path: DrivenPath, ground: GroundSurface
-    ) -> dict[int, OccupancyPart]:
-        """Return the space that the vehicle took up in a tile and its margin, by submap."""
-        path = path.select(self._tiles.bounds(key).wider(self._margin_m).contains(path.points_m))
-        free, passed = log_odds(MIN_PROBABILITY), {}
-        for submap in np.unique(path.submap).tolist():
-            points_m = path.points_m[path.submap == submap]
-            keys = sweep(points_m, ground, self._width_m, self._resolution_m)
-            passed[submap] = free_part(keys, free)
-        return passed
 
     def _crossed(self, margin_m: float) -> list[TileKey]:
         """Return the tiles that the path touches, or comes near to at one of its poses."""

@@ -134,25 +134,19 @@ def mesh_cloud(
     if camera is None:
         mesh, covered = reconstruct_mesh(cloud, settings), {}
     else:
-        mesh = _surface(cloud, camera, settings, _photo_of(run, camera))
+        photo, path = None, run / "mesh" / _PHOTO
+        if path.is_file():  # else the run of the pair made no mesh
+            photo, size = read_image(path), (camera.height_px, camera.width_px)
+            if photo.shape[:2] != size:
+                what, expected = "the image is not that of the run", f"{size[1]}x{size[0]} pixels"
+                got = f"{photo.shape[1]}x{photo.shape[0]}"
+                raise FormatError(what, where=path, got=got, expected=expected)
+            photo = in_colour(photo)
+        mesh = _surface(cloud, camera, settings, photo)
         covered = {"mesh_coverage": _coverage(mesh, cloud, settings)}
     sizes = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     warnings = [line for share in covered.values() for line in check_coverage(share)]
     return mesh, {**sizes, **covered, "warnings": warnings}
-
-
-def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:
-    """The left image of a run of `recon pair`, or None if that made no mesh."""
-    path = folder / "mesh" / _PHOTO
-    if not path.is_file():
-        return None
-    image = read_image(path)
-    size = (camera.height_px, camera.width_px)
-    if image.shape[:2] != size:
-        what, expected = "the image is not that of the run", f"{size[1]}x{size[0]} pixels"
-        got = f"{image.shape[1]}x{image.shape[0]}"
-        raise FormatError(what, where=path, got=got, expected=expected)
-    return in_colour(image)
 
 
 # A point is covered if the mesh is no farther from it than this share of its depth.

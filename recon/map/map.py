@@ -152,7 +152,16 @@ def look_up(tiles: Tiles, xyz: ArrayLike) -> MapPlaces:
     known = np.flatnonzero((np.abs(cells) < KEY_LIMIT).all(axis=1))
     cells = cells[known].astype(np.int64)
     state = np.full(len(places), UNKNOWN, np.int8)
-    state[known] = _states(tiles, cells)
+    states, homes = np.full(len(cells), UNKNOWN, np.int8), cells[:, :2] // tiles.edge_cells
+    for x, y in np.unique(homes, axis=0).tolist():
+        rows = np.flatnonzero((homes == (x, y)).all(axis=1))
+        voxels = drop_undecided(tiles.voxels((x, y)))
+        packed = pack_keys(voxels.keys)
+        order = np.argsort(packed)
+        place, there = find_keys(pack_keys(cells[rows]), packed[order])
+        occupied = voxels.log_odds[order[place[there]]] > 0
+        states[rows[there]] = np.where(occupied, OCCUPIED, FREE)
+    state[known] = states
     seen = None if tiles.looks is None else [np.zeros((0, 4), np.int64)]
     if tiles.looks is not None and seen is not None and len(known):
         keys, home = np.unique(pack_keys(cells), return_inverse=True)
@@ -174,19 +183,6 @@ def _checked(xyz: ArrayLike) -> Float64:
         got = f"{places.dtype} {places.shape}"
         raise ShapeError("not places", got=got, expected=expected)
     return places.astype(np.float64)
-
-
-def _states(tiles: Tiles, cells: Int64) -> Int8:
-    states, homes = np.full(len(cells), UNKNOWN, np.int8), cells[:, :2] // tiles.edge_cells
-    for x, y in np.unique(homes, axis=0).tolist():
-        rows = np.flatnonzero((homes == (x, y)).all(axis=1))
-        voxels = drop_undecided(tiles.voxels((x, y)))
-        keys = pack_keys(voxels.keys)
-        order = np.argsort(keys)
-        place, there = find_keys(pack_keys(cells[rows]), keys[order])
-        occupied = voxels.log_odds[order[place[there]]] > 0
-        states[rows[there]] = np.where(occupied, OCCUPIED, FREE)
-    return states
 
 
 def _nearest(tiles: Tiles, places: Float64) -> Float32:

@@ -21,7 +21,7 @@ from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.kernels.voxels import are_among, distinct_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
-from recon.core.values.arrays import Bool, Float32, Float64, Int64
+from recon.core.values.arrays import Float32, Float64, Int64
 from recon.core.values.grid import log_odds
 from recon.map.builders import Submap
 from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter, Rectangle, TileKey, TileParts
@@ -231,11 +231,17 @@ class Tiles:
 
     def _fused(self, key: TileKey) -> tuple[PointCloud, PointCloud]:
         """Return the points of a tile, frame ``map``: the filtered ones, and those that moved."""
-        kept, removed = [], []
+        kept, removed, fusion = [], [], self.config.fusion
         numbered = ((n, FusedPart.from_tree(tree)) for n, tree in self._parts.read(FUSED, key))
         for drive, parts in groupby(numbered, key=self._chain.drive):
             fused = join_fused(part for _, part in parts)
-            moved = self._moved_rows(key, drive, fused)
+            moved = np.zeros(len(fused), np.bool_)
+            if fusion.remove_moving and self.looks is not None:
+                points = apply(self._T_map_world, fused.points(fusion.voxel_m))
+                counted = fused.enough(self._least_frames, fusion.voxel_m)
+                voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
+                sigma_m = fused.frame_sigma_m
+                moved = find_moved(points, sigma_m, counted, voxels, evidence, self.looks)
             kept.append(fused.select(~moved))
             removed.append(fused.select(moved))
         cloud = filter_cloud(self._exported(kept), self.config.map_filters)
@@ -255,17 +261,6 @@ class Tiles:
         """Return the points in a tile, frame ``map``, of a cloud in frame ``world``."""
         placed = transform_cloud(cloud, self._T_map_world, frame="map")
         return placed.select(self.bounds(key).contains(placed.xyz))
-
-    def _moved_rows(self, key: TileKey, drive: int, fused: FusedPart) -> Bool:
-        """Return which rows of what a drive fused in a tile and its margin are of what moved."""
-        fusion = self.config.fusion
-        if not fusion.remove_moving or self.looks is None:
-            return np.zeros(len(fused), np.bool_)
-        points = apply(self._T_map_world, fused.points(fusion.voxel_m))
-        counted = fused.enough(self._least_frames, fusion.voxel_m)
-        voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
-        sigma_m = fused.frame_sigma_m
-        return find_moved(points, sigma_m, counted, voxels, evidence, self.looks)
 
 
 _EVIDENCE: Final = "evidence"

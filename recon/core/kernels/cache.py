@@ -66,12 +66,9 @@ def cache_parent() -> Path:
     # Unlike those of Path, these functions take no home and one of somebody else for what they are.
     users = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111
     nearest = next(path for path in (users, *users.parents) if os.path.exists(path))  # noqa: PTH110
-    usable = users.is_absolute() and os.access(nearest, os.W_OK)
-    return users / "recon" if usable else _temporary()
-
-
-def _temporary() -> Path:
-    """Return a folder that is this user's alone: machine code of others must not run."""
+    if users.is_absolute() and os.access(nearest, os.W_OK):
+        return users / "recon"
+    # A folder that is this user's alone: machine code of others must not run.
     user = os.getuid()  # elsewhere than on POSIX there is always a home
     folder = Path(tempfile.gettempdir()) / f"recon-{user}"
     with suppress(FileExistsError):

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -267,21 +267,16 @@ class FirstFix:
                 if other is not None and other.loop is not None:
                     found[number] = other.loop
         self._seen.append((at, [*found.values()]))
-        believed = [loop for loop in self._agreeing() if loop.last == keyframe.frame]
+        loops = [loop for _, loops in self._seen for loop in loops]
+        # The map is a rigid thing: only the drive in it drifts.
+        firsts = {loop.first: (self._known.T_world_camera[loop.first], 0.0, 0) for loop in loops}
+        lasts = {loop.last: at for at, loops in self._seen for loop in loops}
+        alone = breaks > 0 and sum(at[2] == breaks for at, _ in self._seen) == 1
+        needed, scale = 1 if alone else self._frames, self._known.scale
+        agreeing = agreeing_loops(loops, firsts, lasts, keyframes=needed, scale=scale)
+        believed = [loop for loop in agreeing if loop.last == keyframe.frame]
         if not believed:
             return None
         self._seen.clear()
         self._among = None  # once lost, the drive may be anywhere
         return max(believed, key=lambda loop: loop.inliers)
-
-    def _agreeing(self) -> list[Loop]:
-        loops = [loop for _, loops in self._seen for loop in loops]
-        if not loops:
-            return []
-        # The map is a rigid thing: only the drive in it drifts.
-        firsts = {loop.first: (self._known.T_world_camera[loop.first], 0.0, 0) for loop in loops}
-        lasts = {loop.last: at for at, loops in self._seen for loop in loops}
-        breaks = self._seen[-1][0][2]
-        alone = breaks > 0 and sum(at[2] == breaks for at, _ in self._seen) == 1
-        how: Any = {"keyframes": 1 if alone else self._frames, "scale": self._known.scale}
-        return agreeing_loops(loops, firsts, lasts, **how)

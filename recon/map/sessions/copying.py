@@ -96,7 +96,16 @@ def join_parts(
             (part.number, frame): (session.number, begin + frame) for frame in rays if frame >= lead
         }
         part_map.store.copy(RAYS, map_.store, own)
-        _append_submaps(session, part, lead, T_world_part, settings.fusion.voxel_m)
+        for one in part.submaps:
+            frames = one.frames - max(0, lead - one.first_frame)
+            if frames > 0:
+                # Occupancy is made of rays, as where they lie is known now.
+                nothing = one.occupancy.select(np.zeros(len(one.occupancy.rows.blocks), np.bool_))
+                fused = one.fused
+                if lead:
+                    fused = fused.moved(T_world_part, settings.fusion.voxel_m).rounded()
+                number, first = len(session.submaps), session.submaps.frames
+                session.submaps.add(Submap(number, first, frames, fused, nothing))
         poses = session.odometry.T_world_camera
         path_m = path_lengths(poses, session.trusted, settings.scale)
         stretch = stretches(session.health)
@@ -163,16 +172,3 @@ def _append_frames(session: Session, part: Session, lead: int) -> Float64:
         T = orthonormalise(T_world_part @ T_part_camera) if lead else T_part_camera
         session.add_frame(T, float(path.timestamps_s[frame]), health[frame])
     return T_world_part
-
-
-def _append_submaps(
-    session: Session, part: Session, lead: int, T_world_part: Float64, voxel_m: float
-) -> None:
-    """Add what a part fused; occupancy is made from its rays, as where they lie is known now."""
-    for one in part.submaps:
-        frames = one.frames - max(0, lead - one.first_frame)
-        if frames > 0:
-            fused = one.fused.moved(T_world_part, voxel_m).rounded() if lead else one.fused
-            nothing = one.occupancy.select(np.zeros(len(one.occupancy.rows.blocks), np.bool_))
-            number, first = len(session.submaps), session.submaps.frames
-            session.submaps.add(Submap(number, first, frames, fused, nothing))

@@ -78,10 +78,17 @@ class Session:
         self._poses: list[Float64] = []
         self._times_s: list[float] = []
         self._health: list[OdometryHealth] = []
-        self._flushed = 0
         with reading(store.name):
             self.info = value_in(SessionInfo, store.read(SESSION, number))
-            self._read_frames()
+            for first in store.numbers(FRAMES, number):
+                if first != len(self):
+                    got = f"{len(self)} to {first}"
+                    raise FormatError("frames of the drive are missing", got=got)
+                for T, time_s, health in frames_in(store.read(FRAMES, (number, first))):
+                    self.add_frame(T, time_s, health)
+            self._flushed = len(self)
+            if sorted(self._times_s) != self._times_s:
+                raise FormatError("frames of the drive are not in order")
             for name in (BENT, ALONE):
                 if (poses := self.loops.get(name)) is not None:
                     path_of(poses, np.array(self._times_s))
@@ -251,16 +258,6 @@ class Session:
             return
         content = frames_record(self._poses[first:], self._times_s[first:], self._health[first:])
         self._store.put(FRAMES, (self.number, first), content, compress=True)
-
-    def _read_frames(self) -> None:
-        for first in self._store.numbers(FRAMES, self.number):
-            if first != len(self):
-                raise FormatError("frames of the drive are missing", got=f"{len(self)} to {first}")
-            for T, time_s, health in frames_in(self._store.read(FRAMES, (self.number, first))):
-                self.add_frame(T, time_s, health)
-        self._flushed = len(self)
-        if sorted(self._times_s) != self._times_s:
-            raise FormatError("frames of the drive are not in order")
 
 
 SUBMAP: Final = "submap"
