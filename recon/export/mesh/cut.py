@@ -103,18 +103,8 @@ class OnEdges(NamedTuple):
     distance_m: Float64  # of these from the points
 
 
-def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
-    """Return boundary edges of a mesh that lie in a plane: float32 (E, 2, 3)."""
-    return np.asarray(mesh.vertices[_open_corners(mesh, plane)[:, :2]])
-
-
-def open_faces(mesh: TriangleMesh, plane: Plane) -> Int32:
-    """Return int32 (E,), the face that each of the `open_edges` is of."""
-    return np.asarray(_open_corners(mesh, plane)[:, 3])
-
-
 def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float) -> TriangleMesh:
-    """Fit a mesh to the border (E, 2, 3) of its neighbour (`open_edges`), cut along the same plane.
+    """Fit a mesh to the border (E, 2, 3) of its neighbour, cut along the same plane.
 
     The vertices of the mesh move onto the border, and those of the border are inserted into the
     mesh, so that both follow the same line; gaps wider than ``reach_m`` stay.
@@ -128,7 +118,7 @@ def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
     vertices[rows[near]] = found.feet[near]
     vertices[rows[near], plane.axis] = np.float32(plane.at_m)
     mesh = replace(mesh, vertices=vertices)
-    corners = _open_corners(mesh, plane)
+    corners = open_corners(mesh, plane)
     if not len(corners):
         return mesh
     # The vertices of the border go into the boundary edges that they lie next to.
@@ -179,7 +169,7 @@ def _split_faces(faces: Int32, corners: Int32, edge: Places, new: Int32) -> Int3
     return np.concatenate([faces[kept], *fans])
 
 
-def _open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
+def open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
     """Return boundary edges in a plane, int32 (E, 4): ends, third vertex and number of the face."""
     held = plane.holds(mesh.vertices)
     rows = np.flatnonzero(held[mesh.faces].sum(axis=1) >= 2).astype(np.int32)

@@ -28,8 +28,7 @@ from recon.export.mesh.cut import (
     components,
     cut_mesh,
     nearest_on_edges,
-    open_edges,
-    open_faces,
+    open_corners,
     with_faces,
 )
 from recon.export.mesh.poisson import (
@@ -246,8 +245,9 @@ class _Mesher:
         first = sum(map(len, self.sizes))
         self.sizes.append(sizes)
         for plane, border in borders.items():
-            components = labels[open_faces(mesh, plane)].astype(np.int64) + first
-            own = Border(open_edges(mesh, plane), components)
+            corners = open_corners(mesh, plane)
+            components = labels[corners[:, 3]].astype(np.int64) + first
+            own = Border(mesh.vertices[corners[:, :2]], components)
             if border is None:
                 self.borders[key, plane] = own
             elif len(own.edges) and len(border.edges):
