@@ -189,8 +189,8 @@ def usable(cloud: PointCloud) -> PointCloud:
     if spread[1] <= 1e-5 * max(spread[2], farthest):
         distant = spread[1] > 1e-5 * spread[2] and spread[1] > 0
         got = f"{counted(len(cloud), 'point')}, up to {farthest:.3g} m from the origin"
-        hint = "subtract an offset from all coordinates" if distant else None
-        raise MeshingError("all points lie in one place or on one line", got=got, hint=hint)
+        way_on = "subtract an offset from all coordinates" if distant else None
+        raise MeshingError("all points lie in one place or on one line", got=got, hint=way_on)
     return cloud
 
 

@@ -57,9 +57,9 @@ def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = (
     for kind in _KINDS:
         keys: dict[Key, Key] = {}
         for key in source.store.keys(kind):
-            session, *rest = key if isinstance(key, tuple) else (key,)
-            if session in numbers:
-                keys[key] = (numbers[session], *rest) if rest else numbers[session]
+            number, *rest = key if isinstance(key, tuple) else (key,)
+            if number in numbers:
+                keys[key] = (numbers[number], *rest) if rest else numbers[number]
         source.store.copy(kind, target.store, keys)
     linked = [numbers[s.number] for s in source.linked if s.number in numbers]
     links = [
