@@ -24,7 +24,7 @@ import checkout  # noqa: F401 - what is measured
 import cv2
 import numpy as np
 
-from recon.core.memory import peak_memory_mb
+from recon.core.machine import peak_memory_mb
 from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import UInt8
 from recon.io.middlebury import stand_in_camera

@@ -30,9 +30,9 @@ from recon.core.values import RectifiedCamera, StereoCalibration, TriangleMesh
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import unproject
 from recon.core.values.image import Recorded
-from recon.export.mesh.coverage import mesh_coverage
 from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.poisson import reconstruct_mesh
+from recon.export.pair import mesh_coverage
 from recon.io.images.disparity import read_disparity
 from recon.sources.one_pair import read_pair_input
 from recon.sources.registry import open_source

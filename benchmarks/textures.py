@@ -36,10 +36,9 @@ from recon.core.open3d_raycasting import RayScene
 from recon.core.values import RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.camera import unproject
-from recon.export.images import open_images
 from recon.export.mesh.pieces import WHOLE
-from recon.export.mesh.texture import posed_images, textured_mesh
-from recon.export.mesh.views import PosedImage
+from recon.export.mesh.texture import PosedImage, posed_images, textured_mesh
+from recon.export.product import open_images
 from recon.io.images.image import write_image
 from recon.io.models.mesh import read_mesh
 from recon.map.fusion import fusion_range_m

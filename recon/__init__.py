@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from recon.core.shown import SHOWN_BY
+from recon.core.lazy import SHOWN_BY
 
 __version__ = "0.1.0"
 

@@ -58,7 +58,7 @@ from recon.io.trajectory import write_trajectory as write_trajectory
 from recon.map.drive.sequence import MappedSequence as MappedSequence
 from recon.map.drive.sequence import map_sequence as map_sequence
 from recon.map.map import Map as Map
-from recon.map.query import MapPlaces as MapPlaces
+from recon.map.map import MapPlaces as MapPlaces
 from recon.map.sessions.measured import Survey as Survey
 from recon.odometry.protocol import Odometry as Odometry
 from recon.odometry.protocol import OdometryFrame as OdometryFrame

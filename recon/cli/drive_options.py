@@ -27,7 +27,7 @@ def _first_frame(text: str) -> dict[str, Any]:
 
 
 def _memory_limit(text: str) -> dict[str, Any]:
-    from recon.core.memory import parse_size_mb
+    from recon.core.machine import parse_size_mb
 
     return {"memory.limit_mb": parse_size_mb(text)}
 

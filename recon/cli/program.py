@@ -12,7 +12,7 @@ from typing import Any, Final
 import typer
 
 from recon.core.errors import SettingsError
-from recon.core.memory import parse_size_mb
+from recon.core.machine import parse_size_mb
 from recon.io.files import naming
 from recon.io.middlebury import find_image, find_layout
 from recon.run.batch.job import Job

@@ -16,8 +16,7 @@ from recon.cli.tables import batch_table
 from recon.core.progress import stage
 from recon.run.batch.job import is_done
 from recon.run.batch.job_file import read_plan
-from recon.run.batch.results import JobResult, wrong_first
-from recon.run.batch.watch import watch_jobs
+from recon.run.batch.results import JobResult, watch_jobs, wrong_first
 
 
 def show_batch(folder: Path) -> None:

@@ -18,11 +18,10 @@ from recon.commands.config import (
 from recon.core.errors import FormatError, SettingsError
 from recon.core.machine import available_cores
 from recon.export.control import locate
-from recon.export.images import open_images
 from recon.export.make import PRODUCTS, check_target, known_products, make, need_rays, write_product
 from recon.export.mesh.pieces import LAYER, WHOLE
 from recon.export.pair import PAIR_CLOUD, mesh_cloud, write_surface
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, open_images
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath, naming, reading, resolved
 from recon.io.models.las import check_crs

@@ -43,7 +43,7 @@ from recon.map.drive.drive_odometry import doubt_poses
 from recon.map.drive.scale import SceneScale, measure_scene
 from recon.map.drive.sequence import MappedSequence, break_warnings, check_map, map_sequence
 from recon.map.map import Map
-from recon.map.store.finished import keep_map
+from recon.map.sessions.copying import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import ExpectedDrift, expected_drift, health_warnings
 from recon.odometry.prior import MotionPrior

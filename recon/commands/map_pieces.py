@@ -22,8 +22,7 @@ from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import odometry_of
 from recon.map.drive.sequence import map_sequence
 from recon.map.map import Map
-from recon.map.sessions.copying import join_parts
-from recon.map.store.finished import keep_map
+from recon.map.sessions.copying import join_parts, keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.run.batch.cluster import BatchOptions
 from recon.run.batch.job import Job

@@ -26,11 +26,10 @@ from recon.look.rig import RefinedRig
 from recon.map.drive.drive import session_info
 from recon.map.drive.sequence import check_map
 from recon.map.map import Map
-from recon.map.sessions.copying import check_session, copy_sessions, read_all
+from recon.map.sessions.copying import check_session, copy_sessions, keep_map, read_all
 from recon.map.sessions.joining import doubts_of_lengths, join_new
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
 from recon.map.sessions.placed import place_map, settings_of
-from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MAP_FILE
 from recon.map.store.session import Session
 from recon.report.map_page import write_joined_page

@@ -13,7 +13,7 @@ from recon.core.text import with_unit
 from recon.io.files import read_text, reading
 from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply
-from recon.map.store.database import check_format, connect
+from recon.map.store.records import check_format, connect
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
 from recon.run.finished import CLOUD, GRID, command_of_map, figure_of, states_of
 from recon.run.run import SUMMARY

@@ -4,11 +4,10 @@
 - `errors.py`: one tree, one line each; `settings.py`: the base of all settings;
 - `kernels/compiled.py`: how loops are compiled; `kernels/cache.py`: where machine code is kept;
 - `kernels/voxels.py`: hashes and sets of packed cells;
-- `lazy.py`: libraries that are loaded when they are used;
+- `lazy.py`: libraries, and what draws values, loaded when they are used;
 - `plugins.py`: parts that others write, registered by packages or given as objects;
 - `text.py`: numbers read from text and written with words and units;
 - `progress.py`: who is told how far work is; `work.py`: threads, and seconds per stage;
-  `memory.py`: what the process takes, and its limit; `machine.py`: cores, and versions;
-- `shown.py`: how values show themselves, by layers above;
-- `least_squares.py`: the loop of every non-linear fit.
+  `machine.py`: cores, memory and its limit, versions;
+- `geometry/alignment.py`: least squares.
 """

@@ -51,7 +51,6 @@ class Progress(Protocol):
         return
 
     def on_step(self, step: Step) -> None:
-        """Count an item that is done."""
         return
 
     def on_stage(self, name: str) -> None:
@@ -113,10 +112,7 @@ def stage(name: str) -> None:
 
 @contextmanager
 def series(name: str, total: int, unit: str = "frames") -> Iterator[Progress]:
-    """Begin a series of ``total`` items (0 = nobody knows), and end it with the body.
-
-    Its name, if that is empty, is that of the stage.
-    """
+    """Begin a series of ``total`` items (0 = unknown), named as the stage by default; end it."""
     shown = _SHOWN.get()
     shown.on_start(name or _STAGE.get(), total, unit)
     try:
@@ -141,10 +137,7 @@ class Counted:
 def tracked(
     items: Iterable[Item], unit: str, name: str = "", *, total: int | None = None
 ) -> Iterator[Item]:
-    """Yield items, each counted when the next one is asked for.
-
-    ``total`` None is the number of ``items``, where they have one.
-    """
+    """Yield items, ``total`` or as many as they have, each counted when the next is wanted."""
     count = total or (len(items) if isinstance(items, Sized) else 0)
     with series(name, count, unit) as shown:
         before = time.perf_counter()

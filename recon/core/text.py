@@ -29,11 +29,12 @@ def metres(length_m: float, sign: str = "") -> str:
 
 def visible(text: str) -> str:
     """Return a text with control characters, and bytes of odd file names, escaped."""
-    return "".join(one if one.isprintable() or one.isspace() else _escaped(one) for one in text)
-
-
-def _escaped(letter: str) -> str:
-    return letter.encode("unicode_escape", "backslashreplace").decode()
+    return "".join(
+        one
+        if one.isprintable() or one.isspace()
+        else one.encode("unicode_escape", "backslashreplace").decode()
+        for one in text
+    )
 
 
 def parse_number(text: str | bytes) -> float:

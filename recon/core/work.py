@@ -26,10 +26,7 @@ FEW: Final = min(2, available_cores())
 
 
 def use_threads(threads: int | None) -> int:
-    """Limit OpenCV to ``threads`` (None = all cores) and return the number in use.
-
-    More threads than cores would only take memory.
-    """
+    """Limit OpenCV to ``threads`` (None = all cores, the most there are); return how many."""
     count = min(threads or available_cores(), available_cores())
     cv2.setNumThreads(count)
     return count
@@ -114,12 +111,10 @@ class OneBehind:
         self._job: Future[None] | None = None
 
     def begin(self, job: Callable[[], None]) -> None:
-        """Start a job once the previous one has ended."""
         self.wait()
         self._job = self._pool.submit(job)
 
     def wait(self) -> None:
-        """Wait until the last job has ended."""
         job, self._job = self._job, None
         if job is not None:
             job.result()

@@ -1,9 +1,10 @@
-"""The fused cloud of a map as files, and an even sample of it for images and reports."""
+"""The fused cloud of a map as files, also for surveying; an even sample for images and reports."""
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,10 +13,16 @@ from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
+from recon.core.values.arrays import Bool
+from recon.export.occupancy import GROUND_RATIO, Flattening
 from recon.export.product import ExportContext, ExportResult
+from recon.io.models.copc import write_copc
+from recon.io.models.e57 import write_e57
+from recon.io.models.las import write_las
 from recon.io.models.npz import write_npz
 from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import write_ply_tiles
+from recon.map.ground.surface import MAX_TILT_DEG, WINDOW_M, GroundSurface
 from recon.map.tiles import Tiles
 
 SAMPLE_POINTS: Final = 300_000  # points of the fused cloud that are kept for display
@@ -102,8 +109,14 @@ class CloudSample:
     def add(self, cloud: PointCloud) -> None:
         """Add points; all clouds are in map axes and have the same fields."""
         self._kept += [self._thinned(cloud)] if len(cloud) else []
-        if sum(map(len, self._kept)) > self._limit:
-            self._kept = [self._within_the_limit(join_clouds(self._kept))]
+        if sum(map(len, self._kept)) <= self._limit:
+            return
+        self._cell_m = self._cell_m or self._first_cell_m
+        thinned = self._thinned(join_clouds(self._kept))
+        while len(thinned) > self._limit:
+            self._cell_m *= _GROWTH
+            thinned = self._thinned(thinned)
+        self._kept = [thinned]
 
     def passing(self, tiles: Tiles) -> Iterator[PointCloud]:
         """Yield the clouds of tiles that have points, which are added."""
@@ -112,20 +125,53 @@ class CloudSample:
             yield cloud
 
     def cloud(self) -> PointCloud:
-        """Return the sample."""
         return join_clouds(self._kept)
-
-    def _within_the_limit(self, cloud: PointCloud) -> PointCloud:
-        """Thin a cloud, with growing cells, until it is within the limit."""
-        self._cell_m = self._cell_m or self._first_cell_m
-        thinned = self._thinned(cloud)
-        while len(thinned) > self._limit:
-            self._cell_m *= _GROWTH
-            thinned = self._thinned(thinned)
-        return thinned
 
     def _thinned(self, cloud: PointCloud) -> PointCloud:
         if self._cell_m is None:
             return cloud
         keys = voxels.pack_keys(np.floor(cloud.xyz / self._cell_m).astype(np.int64))
         return cloud.select(np.sort(np.unique(keys, return_index=True)[1]))
+
+
+def las_product(
+    context: ExportContext, path: Path, write: Callable[..., int] = write_las
+) -> ExportResult:
+    """Write the cloud as LAS or LAZ, with the ground as a class, perhaps where a survey says."""
+    clouds = (tile.cloud for tile in context.placed.tiles)
+    # A hundredth of a voxel, as a decimal: a millimetre on a road.
+    step_m = 10.0 ** math.floor(math.log10(context.placed.tiles.config.fusion.voxel_m) - 2.0)
+    tiles, known = context.placed.tiles, dict(Flattening(context.placed).grounds())
+
+    def are_ground(cloud: PointCloud) -> Bool:
+        """Return which points of a tile are ground; far from the path, none is known to be."""
+        if not len(cloud):
+            return np.zeros(0, np.bool_)
+        column, row = (cloud.xyz[0, :2] // tiles.edge_m).astype(int).tolist()
+        surface = known.get(tiles.bounds((column, row)))
+        return np.zeros(len(cloud), np.bool_) if surface is None else ground_points(cloud, surface)
+
+    how = {"step_m": step_m, "ground": are_ground}
+    return ExportResult({"points": write(path, clouds, context.T_survey_map, context.crs, **how)})
+
+
+def copc_product(context: ExportContext, path: Path) -> ExportResult:
+    """Write the cloud as COPC, as `las_product` does."""
+    return las_product(context, path, write_copc)
+
+
+def e57_product(context: ExportContext, path: Path) -> ExportResult:
+    """Write the cloud as E57, perhaps where a survey says."""
+    clouds = (tile.cloud for tile in context.placed.tiles)
+    return ExportResult({"points": write_e57(path, clouds, context.T_survey_map, context.crs)})
+
+
+def ground_points(cloud: PointCloud, surface: GroundSurface) -> Bool:
+    """Return bool (N,), which points lie on a surface and, if normals are known, face up."""
+    above_m = cloud.xyz[:, 2] - surface.height_at(cloud.xyz[:, :2])
+    below_m = -above_m[(above_m <= 0) & (above_m >= -WINDOW_M)]
+    thick_m = float(np.quantile(below_m, GROUND_RATIO)) if len(below_m) else 0.0
+    on = np.abs(above_m) <= thick_m  # not where the surface is unknown
+    if cloud.normals is not None:
+        on &= cloud.normals[:, 2] >= math.cos(math.radians(MAX_TILT_DEG))
+    return np.asarray(on)

@@ -10,12 +10,10 @@ import numpy as np
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.camera import project
-from recon.export.images import DriveImages
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import DriveImages, ExportContext, ExportResult
 from recon.io.images.image import write_image
 from recon.io.models.colmap import ColmapModel, Seen, write_colmap
-from recon.map.store.trees import loop_in
-from recon.places.adjustment import SharedPoints, shared_points
+from recon.places.adjustment import shared_points
 from recon.places.closure import Closure, DrivePath
 from recon.sources.source import check_source
 
@@ -40,21 +38,17 @@ def colmap_product(context: ExportContext, folder: Path) -> ExportResult:
     return ExportResult({"colmap_images": images, "colmap_points": points}, warnings)
 
 
-def _points(drive: DriveImages) -> SharedPoints:
-    session = drive.session
-    path = DrivePath.of(session.odometry, session.health, session.scale)
-    loops = tuple(loop_in(tree) for tree in session.loops.get("closed", ()))
-    closure = Closure(session.trajectory, loops, ())
-    among = [frame for frame in session.keyframes.frames if drive.placed[frame]]
-    return shared_points(path, closure, session.keyframes, session.camera, among)
-
-
 class _Written:
     """A drive on its way into a model: its frames, then the points that they see."""
 
     def __init__(self, drive: DriveImages, model: ColmapModel, first: int) -> None:
         self._drive, self._model, self._first = drive, model, first
-        self._points, self._camera = _points(drive), drive.session.camera
+        session = drive.session
+        path = DrivePath.of(session.odometry, session.health, session.scale)
+        closure, keyframes = Closure(session.trajectory, session.closed, ()), session.keyframes
+        among = [frame for frame in keyframes.frames if drive.placed[frame]]
+        self._camera = session.camera
+        self._points = shared_points(path, closure, keyframes, self._camera, among)
         self._xyz = apply(drive.session.T_map_world, self._points.xyz)
         self._rgb = np.zeros((len(self._xyz), 3), np.uint8)
         self._off_px = np.zeros(len(self._xyz))  # summed over the images of a point
@@ -90,7 +84,6 @@ class _Written:
         return [(np.column_stack([x, v])[k], points[k] + self._first) for x, _, k in views]
 
     def add_points(self) -> int:
-        """Add the points; their number."""
         off_px = self._off_px / np.maximum(1, [*map(len, self._tracks)])
         each = zip(self._xyz, self._rgb.tolist(), off_px.tolist(), self._tracks, strict=True)
         for number, point in enumerate(each, start=self._first):

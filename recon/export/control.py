@@ -17,8 +17,7 @@ from recon.core.text import metres
 from recon.core.values import Disparity, RectifiedCamera, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import project, unproject
-from recon.export.images import DriveImages, open_images
-from recon.io.control_points import ControlPoints
+from recon.export.product import DriveImages, open_images
 from recon.io.models.las import check_inside
 from recon.map.map import Map
 from recon.map.sessions.georeference import Georeference, edge_m, georeference
@@ -32,13 +31,6 @@ _CLICK_PX: Final = 1.0  # standard deviation of a pixel that a person has chosen
 _SURVEYED_M: Final = 0.02  # of a coordinate, by a receiver with corrections
 
 
-def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | None) -> Georeference:
-    """Place a map by what a survey measured: positions along its first drive, or control points."""
-    if survey.control is None:
-        return georeference(map_, survey)
-    return georeference_by_points(map_, survey.control, survey.positions, images, threads)
-
-
 class _Sighting(NamedTuple):
     """What an image shows of a point."""
 
@@ -48,22 +40,19 @@ class _Sighting(NamedTuple):
     sigma_px: Float64  # (3,)
 
 
-def georeference_by_points(
-    map_: Map,
-    control: ControlPoints,
-    where: Path,
-    images: Sequence[Path] = (),
-    threads: int | None = None,
-) -> Georeference:
-    """Place a map by control points that its left images show.
+def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | None) -> Georeference:
+    """Place a map by what a survey measured: positions along its first drive, or control points.
 
-    Each point is found in map axes by all that images show of it, with their disparities, as
-    uncertain as these are; then the map is turned and moved, rigid, by the points that agree.
+    A control point is found in map axes by all that left images show of it, with their disparities,
+    as uncertain as these are; then the map is turned and moved, rigid, by the points that agree.
 
     Raises:
         EvaluationError: Fewer than three points can be found in the map, an image is not there, or
             the points do not fix how the map is turned.
     """
+    control, where = survey.control, survey.positions
+    if control is None:
+        return georeference(map_, survey)
     images_of = _Images(open_images(map_, images), where, threads)
     lines, points, ours = [], [], []
     for point in tracked(control.points, "points", "match control points"):
@@ -155,10 +144,7 @@ class _Images:
 
 
 def _located(sightings: Sequence[_Sighting]) -> tuple[Float64, Float64] | None:
-    """Return a point (3,), map axes, and its covariance; None without depth.
-
-    By least squares over columns, rows and disparities, as uncertain as they are.
-    """
+    """Return a point (3,), map axes, by least squares, and its covariance; None without depth."""
     deep = [one for one in sightings if np.isfinite(one.uvd[2])]
     if not deep:
         return None
@@ -179,10 +165,7 @@ def _located(sightings: Sequence[_Sighting]) -> tuple[Float64, Float64] | None:
 
 
 def _fitted(ours_m: Float64, place_m: Float64, spread: Float64) -> Float64:
-    """Return T_survey_map, rigid, by points with covariances (N, 3, 3) in map axes.
-
-    That the map is level is known to a few degrees.
-    """
+    """Return T_survey_map, nearly level, by points with covariances (N, 3, 3) in map axes."""
     start = fit_upright(ours_m, place_m).T_to_from
     middle_m = ours_m.mean(axis=0)
 

@@ -12,10 +12,16 @@ from recon.core.errors import MappingError, MeshingError, OutputError, SettingsE
 from recon.core.progress import stage
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
 from recon.core.work import Stopwatch
-from recon.export.cloud import arrays_product, cloud_product, pcd_product
+from recon.export.cloud import (
+    arrays_product,
+    cloud_product,
+    copc_product,
+    e57_product,
+    las_product,
+    pcd_product,
+)
 from recon.export.colmap import colmap_product
-from recon.export.costmap import costmap_product
-from recon.export.gridmap import gridmap_product
+from recon.export.costmap import costmap_product, gridmap_product
 from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
 from recon.export.mesh.texture import texture_product
@@ -23,11 +29,9 @@ from recon.export.nerfstudio import nerfstudio_product
 from recon.export.occupancy import grid_product, octomap_product
 from recon.export.product import ExportContext, ExportResult, Product
 from recon.export.rasters import RASTERS, raster_product, stem_of
-from recon.export.survey import copc_product, e57_product, las_product
 from recon.io.atomic import check_targets, writing_to
 from recon.io.models.mesh import MESH_SUFFIXES
-from recon.map.sessions.placed import has_occupancy
-from recon.map.store.finished import check_rays
+from recon.map.sessions.placed import check_rays, has_occupancy
 
 # In the order in which they are made.
 PRODUCTS: Final[Mapping[str, Product]] = {
@@ -71,7 +75,6 @@ class Products:
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Their figures for the summary."""
         return {name: value for one in self.made.values() for name, value in one.figures.items()}
 
     @property

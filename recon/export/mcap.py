@@ -13,9 +13,8 @@ from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64, UInt8
 from recon.export.cloud import even_sample
-from recon.export.images import DriveImages
-from recon.export.occupancy import make_grid
-from recon.export.product import ExportContext, ExportResult
+from recon.export.occupancy import Flattening
+from recon.export.product import DriveImages, ExportContext, ExportResult
 from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
 from recon.io.models.ros_bag import Message, RosBag, header, points, pose, write_bag
@@ -34,7 +33,7 @@ def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
     a survey are a frame, ``survey``, in which that of the map lies.
     """
     warnings = []
-    grid, height_m, _ = make_grid(context.placed)
+    grid, height_m, _ = Flattening(context.placed).grid()
     images: dict[int, DriveImages] = {}
     try:
         images = {one.session.number: one for one in context.drives}
@@ -109,7 +108,6 @@ class _Drive:
             yield from images.views()
 
     def write(self, bag: RosBag, frame: int, views: tuple[UInt8, ...]) -> None:
-        """Write all messages of a frame."""
         time_ns, T, base = self.times_ns[frame], self._T_map_base[frame], f"{self.name}base_link"
         bag.write("/tf", time_ns, _transforms(time_ns, [("map", base, T)]))
         spread = np.diag(np.repeat(self._variance[frame], 3)).ravel()
@@ -139,10 +137,7 @@ class _Drive:
 
 
 def _variance(session: Session) -> Float64:
-    """Return (N, 2), variances of positions and rotations since the beginning of each segment.
-
-    They are what odometry states, and what it usually drifts; loops that were closed make less.
-    """
+    """Return (N, 2), variances of positions and rotations since the beginning of each segment."""
     path = DrivePath.of(session.odometry, session.health, session.scale)
     begins = np.searchsorted(np.maximum.accumulate(path.segment), path.segment)
     drift = np.stack(spread_over(path.path_m - path.path_m[begins], path.scale), axis=1)

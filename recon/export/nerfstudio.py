@@ -20,14 +20,12 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Int64
 from recon.core.values.camera import project
 from recon.export.cloud import even_sample
-from recon.export.images import DriveImages
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import DriveImages, ExportContext, ExportResult
 from recon.io.fields import write_json
 from recon.io.images.image import write_image
 from recon.io.models.colmap import PIXEL_CENTRE
 from recon.io.models.ply import write_ply
 from recon.map.sessions.placed import settings_of
-from recon.map.tiles import Tiles
 from recon.stereo.frame import FrameReconstructor, back_project
 
 _OPENGL: Final = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y up, looking along -z
@@ -37,11 +35,15 @@ _POINTS: Final = "sparse_pc.ply"
 
 
 def nerfstudio_product(context: ExportContext, folder: Path) -> ExportResult:
-    """Write a folder with ``transforms.json`` and what it names, in map axes.
-
-    Frames are left images; all are matched again, as they were mapped, for their depth.
-    """
-    drives, moved = context.drives, _moved_cells(context.placed.tiles)
+    """Write ``transforms.json`` and what it names, map axes; depth is matched again."""
+    drives, tiles = context.drives, context.placed.tiles
+    # Packed voxels in which something moved, and those that touch one, sorted.
+    steps, found = np.array(list(product((-1, 0, 1), repeat=3))), [np.zeros(0, np.int64)]
+    for tile in tiles:
+        cells = np.floor(tile.removed.xyz.astype(np.float64) / tiles.config.fusion.voxel_m)
+        around = cells.astype(np.int64)[:, None] + steps
+        found.append(distinct_keys(pack_keys(around.reshape(-1, 3))))
+    moved = distinct_keys(np.concatenate(found))
     whole = all(drive.rectifier.valid is None or drive.rectifier.valid.all() for drive in drives)
     # All frames have a mask, or none: readers count them.
     masked, frames = None if whole and not len(moved) else moved, []
@@ -54,7 +56,7 @@ def nerfstudio_product(context: ExportContext, folder: Path) -> ExportResult:
                 write_image(folder / name, image)
             pose = drive.T_map_camera[frame] @ _OPENGL
             frames.append({**named, "transform_matrix": pose.tolist(), **camera})
-    write_ply(folder / _POINTS, even_sample(context.placed.tiles))
+    write_ply(folder / _POINTS, even_sample(tiles))
     content = {
         "camera_model": "OPENCV",
         **(_intrinsics(drives[0].session.camera) if len(drives) == 1 else {}),
@@ -111,13 +113,3 @@ def shadow(xyz: Float32, camera: RectifiedCamera, voxel_m: float) -> Bool:
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (wide_px, wide_px))
         hit = np.asarray(cv2.morphologyEx(hit, cv2.MORPH_CLOSE, kernel), np.uint8)
     return hit > 0
-
-
-def _moved_cells(tiles: Tiles) -> Int64:
-    """Return packed voxels in which something moved, and those that touch one, sorted."""
-    steps, found = np.array(list(product((-1, 0, 1), repeat=3))), [np.zeros(0, np.int64)]
-    for tile in tiles:
-        cells = np.floor(tile.removed.xyz.astype(np.float64) / tiles.config.fusion.voxel_m)
-        around = cells.astype(np.int64)[:, None] + steps
-        found.append(distinct_keys(pack_keys(around.reshape(-1, 3))))
-    return distinct_keys(np.concatenate(found))

@@ -23,8 +23,15 @@ from recon.io.models.octomap import write_octomap_tiles
 from recon.map.builders import MIN_PROBABILITY
 from recon.map.cut import Rectangle, TileKey
 from recon.map.ground.axes import base_axes
-from recon.map.ground.driven import DrivenPath, is_driven, sweep
-from recon.map.ground.grid import GridSettings, drop_undecided, flatten, ground_depths
+from recon.map.ground.grid import (
+    DrivenPath,
+    GridSettings,
+    drop_undecided,
+    flatten,
+    ground_depths,
+    is_driven,
+    sweep,
+)
 from recon.map.ground.surface import (
     GroundSettings,
     GroundSurface,
@@ -43,11 +50,13 @@ GROUND_RATIO: Final = 0.95
 # start.
 _MARGIN_M: Final = 5.0
 MadeGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
+"""A grid, the height at which something carried the camera above the ground (None = unknown, or not
+at one height), and what a user of the grid should know."""
 
 
 def grid_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the flat grid as Nav2 reads it, given the path of its YAML file."""
-    grid, height_m, warnings = make_grid(context.placed)
+    grid, height_m, warnings = Flattening(context.placed).grid()
     write_nav2(path.with_suffix(""), grid)
     rows, columns = grid.cells.shape
     figures = {
@@ -60,21 +69,6 @@ def grid_product(context: ExportContext, path: Path) -> ExportResult:
         "T_base_camera": base_axes(context.map.first.T_map_world, height_m).tolist(),
     }
     return ExportResult(figures, warnings, grid)
-
-
-def make_grid(placed: PlacedMap) -> MadeGrid:
-    """Flatten the voxels of a map above its ground.
-
-    Returns:
-        The grid, the height at which something carried the camera above the ground (None = unknown,
-        or not at one height), and what a user of the grid should know.
-    """
-    return Flattening(placed).grid()
-
-
-def grounds(placed: PlacedMap) -> Iterator[tuple[Rectangle, GroundSurface]]:
-    """Yield the tiles of a map that are near the path, and the ground in each."""
-    return Flattening(placed).grounds()
 
 
 Finish = Callable[[OccupancyGrid, GroundSurface, Int32], OccupancyGrid]
@@ -100,10 +94,17 @@ class Flattening:
         self._ground_depths: list[Float64] = [np.zeros(0)]
 
     def grid(self) -> MadeGrid:
+        """Flatten the voxels of the map above its ground."""
         if self._tiles.extent[0] == self._tiles.extent[1]:
             raise MappingError("nothing was observed: there is no map to flatten")
         settings, driven = self._along_the_path()
-        low, high = self._extent()
+        low, high = self._tiles.extent
+        path_m = self._path_m[self._trusted, :2]
+        if len(path_m):
+            first = np.floor((path_m.min(axis=0) - self._margin_m) / self._resolution_m)
+            last = np.ceil((path_m.max(axis=0) + self._margin_m) / self._resolution_m)
+            low = (min(low[0], int(first[0])), min(low[1], int(first[1])))
+            high = (max(high[0], int(last[0])), max(high[1], int(last[1])))
         shape = (high[1] - low[1], high[0] - low[0])
         if math.prod(shape) > _MOST_CELLS:
             got, expected = f"{shape[1]} x {shape[0]} cells", f"at most {_MOST_CELLS:g} cells"
@@ -157,17 +158,6 @@ class Flattening:
                 "fall through; widen it, or take smaller cells"
             )
 
-    def _extent(self) -> tuple[TileKey, TileKey]:
-        """Return the smallest x and y of the cells, and the largest ones plus one."""
-        low, high = self._tiles.extent
-        path_m = self._path_m[self._trusted, :2]
-        if not len(path_m):
-            return low, high
-        first = np.floor((path_m.min(axis=0) - self._margin_m) / self._resolution_m)
-        last = np.ceil((path_m.max(axis=0) + self._margin_m) / self._resolution_m)
-        low, high = np.minimum(low, first).astype(int), np.maximum(high, last).astype(int)
-        return (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
-
     def _flat(
         self, key: TileKey, settings: GroundSettings, path: DrivenPath | None
     ) -> OccupancyGrid | None:
@@ -175,7 +165,14 @@ class Flattening:
         ground = self._ground(key, settings)
         if ground is None:
             return None
-        passed = {} if path is None else self._passed(key, path, ground)
+        passed: dict[int, OccupancyPart] = {}
+        if path is not None:  # the space that the vehicle took up, by submap
+            area = self._tiles.bounds(key).wider(self._margin_m)
+            path, free = path.select(area.contains(path.points_m)), log_odds(MIN_PROBABILITY)
+            for submap in np.unique(path.submap).tolist():
+                points_m = path.points_m[path.submap == submap]
+                keys = sweep(points_m, ground, self._width_m, self._resolution_m)
+                passed[submap] = free_part(keys, free)
         voxels = self._tiles.wide_voxels(key, passed)
         self._ground_depths.append(ground_depths(voxels, ground))
         if not len(voxels):
@@ -205,18 +202,6 @@ class Flattening:
     def _ground_points(self, area: Rectangle) -> PointCloud:
         """Return points in which ground is looked for: those of the cloud, and floors of voxels."""
         return add_floors(self._tiles.cloud_in(area), self._tiles.floors_in(area))
-
-    def _passed(
-        self, key: TileKey, path: DrivenPath, ground: GroundSurface
-    ) -> dict[int, OccupancyPart]:
-        """Return the space that the vehicle took up in a tile and its margin, by submap."""
-        path = path.select(self._tiles.bounds(key).wider(self._margin_m).contains(path.points_m))
-        free, passed = log_odds(MIN_PROBABILITY), {}
-        for submap in np.unique(path.submap).tolist():
-            points_m = path.points_m[path.submap == submap]
-            keys = sweep(points_m, ground, self._width_m, self._resolution_m)
-            passed[submap] = free_part(keys, free)
-        return passed
 
     def _crossed(self, margin_m: float) -> list[TileKey]:
         """Return the tiles that the path touches, or comes near to at one of its poses."""

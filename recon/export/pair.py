@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,12 +11,12 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import FormatError, MeshingError
+from recon.core.open3d_raycasting import RayScene
 from recon.core.values import Disparity, PointCloud, RectifiedCamera, Texture, TriangleMesh
 from recon.core.values.arrays import UInt8
 from recon.core.values.camera import depth_from_disparity, project
 from recon.core.values.cloud import Frame
 from recon.core.values.image import in_colour
-from recon.export.mesh.coverage import check_coverage, mesh_coverage
 from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.pieces import WHOLE
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
@@ -33,12 +34,7 @@ _PHOTO: Final = "left.png"  # the left image, beside the mesh
 def mesh_frame(
     frame: ReconstructedFrame, settings: MeshSettings
 ) -> tuple[TriangleMesh | None, float | None, tuple[str, ...]]:
-    """Mesh the cloud of a frame as its camera saw it.
-
-    Returns:
-        The surface in camera axes, or None; the fraction of the measured points that lie on it;
-        warnings.
-    """
+    """Mesh a frame: surface in camera axes or None, fraction of measured points on it, warnings."""
     try:
         mesh = _surface(frame.cloud, frame.pair.camera, settings, frame.pair.colours)
         coverage = _coverage(mesh, frame.cloud, settings)
@@ -65,12 +61,10 @@ def _surface(
 
 
 def _coverage(mesh: TriangleMesh, cloud: PointCloud, settings: MeshSettings) -> float:
-    """Return the fraction of the measured points that lie on a mesh; of all, if none is measured.
-
-    Of a closed body, on its front, whose vertices come first.
-    """
+    """Return the fraction of the measured points, if there are any, on the front of a mesh."""
     measured = cloud.only_measured()
     if settings.pair_solid_m is not None:
+        # Of a closed body, vertices in front come first.
         front = (mesh.faces < len(mesh.vertices) // 2).all(axis=1)
         mesh = replace(mesh, faces=mesh.faces[front])
     return mesh_coverage(mesh, measured if len(measured) else cloud)
@@ -102,10 +96,7 @@ def write_disparity_files(
 
 
 def write_cloud_files(
-    frame: ReconstructedFrame,
-    mesh: TriangleMesh | None,
-    formats: Sequence[str],
-    folder: Path,
+    frame: ReconstructedFrame, mesh: TriangleMesh | None, formats: Sequence[str], folder: Path
 ) -> None:
     """Write cloud and mesh (PLY and ``formats``), and a project with the left image."""
     write_ply(folder / PAIR_CLOUD, frame.cloud)
@@ -143,22 +134,38 @@ def mesh_cloud(
     if camera is None:
         mesh, covered = reconstruct_mesh(cloud, settings), {}
     else:
-        mesh = _surface(cloud, camera, settings, _photo_of(run, camera))
+        photo, path = None, run / "mesh" / _PHOTO
+        if path.is_file():  # else the run of the pair made no mesh
+            photo, size = read_image(path), (camera.height_px, camera.width_px)
+            if photo.shape[:2] != size:
+                what, expected = "the image is not that of the run", f"{size[1]}x{size[0]} pixels"
+                got = f"{photo.shape[1]}x{photo.shape[0]}"
+                raise FormatError(what, where=path, got=got, expected=expected)
+            photo = in_colour(photo)
+        mesh = _surface(cloud, camera, settings, photo)
         covered = {"mesh_coverage": _coverage(mesh, cloud, settings)}
     sizes = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
     warnings = [line for ratio in covered.values() for line in check_coverage(ratio)]
     return mesh, {**sizes, **covered, "warnings": warnings}
 
 
-def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:
-    """The left image of a run of `recon pair`, or None if that made no mesh."""
-    path = folder / "mesh" / _PHOTO
-    if not path.is_file():
-        return None
-    image = read_image(path)
-    size = (camera.height_px, camera.width_px)
-    if image.shape[:2] != size:
-        what, expected = "the image is not that of the run", f"{size[1]}x{size[0]} pixels"
-        got = f"{image.shape[1]}x{image.shape[0]}"
-        raise FormatError(what, where=path, got=got, expected=expected)
-    return in_colour(image)
+# A point is covered if the mesh is no farther from it than this fraction of its depth.
+COVERED_WITHIN: Final = 0.005
+LEAST_COVERAGE: Final = 0.8  # fraction of the points of a pair that its mesh should cover
+_COVERAGE_SAMPLES: Final = 100_000
+
+
+def mesh_coverage(mesh: TriangleMesh, cloud: PointCloud) -> float:
+    """Return the fraction of points, of at most 100,000, that the mesh of a pair covers."""
+    xyz = cloud.xyz[:: math.ceil(len(cloud) / _COVERAGE_SAMPLES)]
+    distance_m = RayScene(mesh.vertices[mesh.faces]).distance(xyz)
+    return float(np.mean(distance_m <= COVERED_WITHIN * xyz[:, 2]))
+
+
+def check_coverage(coverage: float) -> tuple[str, ...]:
+    """Return a warning if the mesh of a pair leaves out much of its cloud."""
+    if coverage >= LEAST_COVERAGE:
+        return ()
+    tolerance = f"points within {100 * COVERED_WITHIN:g} % of their depth"
+    advice = "lower mesh.min_component_faces, or use the cloud"
+    return (f"the mesh covers {100 * coverage:.2g} % of the cloud ({tolerance}); {advice}",)

@@ -26,19 +26,16 @@ _POINTS, _SURFACE = "points.npz", "surface.npz"
 
 
 def screened_poisson(
-    xyz: NDArray[Any],
-    normals: NDArray[Any],
-    depth: int,
-    scale: float,
-    point_weight: float,
+    xyz: NDArray[Any], normals: NDArray[Any], depth: int, scale: float, point_weight: float
 ) -> tuple[Float32, Int32, Float32]:
     """Return the closed surface through points (N, 3) with outward unit normals, all finite.
 
     Args:
         xyz: Metres.
         normals: Of the points.
-        depth: Depth of the octree: its edge has 2^depth cells.
-        scale: Edge of the octree, as a multiple of the longest side of the cloud.
+        depth: Depth of the octree: its edge, ``scale`` times the longest side of the cloud, has
+            2^depth cells.
+        scale: See ``depth``.
         point_weight: Weight of interpolating the points relative to fitting the normals.
 
     Returns:

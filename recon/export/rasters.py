@@ -6,6 +6,7 @@ North is up: the map is turned as the survey is, and what each tile has is writt
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -16,7 +17,7 @@ from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import UNKNOWN, PointCloud
 from recon.core.values.arrays import Bool, Float64, Int64
-from recon.export.occupancy import grounds, make_grid
+from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext, ExportResult
 from recon.io.models.geotiff import RasterFile, RasterPlace, write_geotiff
 from recon.map.ground.surface import GroundSurface
@@ -106,19 +107,9 @@ def _surface_colours(context: ExportContext, file: RasterFile, T_file_map: Float
         file.write(one.row, one.column, np.where(before[3] > 0, before, colours))
 
 
-def _ground_heights(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
-    """Write the height of the ground in the middle of each cell."""
-
-    def heights(ground: GroundSurface, xy_m: Float64) -> Float64:
-        xyz = np.column_stack([xy_m, ground.height_at(xy_m)])
-        return np.asarray(apply(T_file_map, xyz)[:, 2])
-
-    _write_ground(context, file, T_file_map, heights)
-
-
-def _ground_slopes(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
-    """Write by how many degrees the ground is inclined."""
-    _write_ground(context, file, T_file_map, lambda *where: np.degrees(ground_slopes(*where)))
+def _ground_heights(ground: GroundSurface, xy_m: Float64, T_file_map: Float64) -> Float64:
+    xyz = np.column_stack([xy_m, ground.height_at(xy_m)])
+    return np.asarray(apply(T_file_map, xyz)[:, 2])
 
 
 def ground_slopes(ground: GroundSurface, xy_m: Float64) -> Float64:
@@ -130,7 +121,7 @@ def ground_slopes(ground: GroundSurface, xy_m: Float64) -> Float64:
 
 def _flat_grid(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
     """Write what the flat grid has at the middle of each cell: 0 = free, 100 = occupied."""
-    grid, T_map_file, place = make_grid(context.placed)[0], invert(T_file_map), file.place
+    grid, T_map_file, place = Flattening(context.placed).grid()[0], invert(T_file_map), file.place
     for row in range(0, place.rows, _ROWS):
         shape = min(_ROWS, place.rows - row), place.columns
         middles = place.centres(row, 0, shape).reshape(-1, 2)
@@ -144,15 +135,16 @@ def _flat_grid(context: ExportContext, file: RasterFile, T_file_map: Float64) ->
         file.write(row, 0, values.reshape(1, *shape))
 
 
-def _write_ground(
+def _ground(
     context: ExportContext,
     file: RasterFile,
     T_file_map: Float64,
-    measure: Callable[[GroundSurface, Float64], Float64],
+    *,
+    measure: Callable[[GroundSurface, Float64, Float64], Float64],
 ) -> None:
     """Write what is measured of the ground of each tile at the middles of cells."""
     T_map_file, place = invert(T_file_map), file.place
-    for bounds, ground in grounds(context.placed):
+    for bounds, ground in Flattening(context.placed).grounds():
         low, high = np.array(bounds.low), np.array(bounds.high)
         corners = np.pad(low + _CORNERS * (high - low), ((0, 0), (0, 1)))
         row, column = place.cells_of(apply(T_file_map, corners)[:, :2])
@@ -164,14 +156,14 @@ def _write_ground(
         level = np.full((len(middles), 1), T_file_map[2, 3])
         xy_m = apply(T_map_file, np.hstack([middles, level]))[:, :2]
         inside, values = bounds.contains(xy_m), np.full(len(xy_m), np.nan, np.float32)
-        values[inside] = measure(ground, xy_m[inside])
+        values[inside] = measure(ground, xy_m[inside], T_file_map)
         file.write(*first, np.fmax(file.read(*first, shape), values.reshape(shape)))
 
 
 RASTERS: Final[dict[str, tuple[Fill, bool]]] = {
     "dsm": (_surface_heights, False),
-    "dtm": (_ground_heights, False),
-    "slope": (_ground_slopes, False),
+    "dtm": (partial(_ground, measure=_ground_heights), False),
+    "slope": (partial(_ground, measure=lambda *at: np.degrees(ground_slopes(*at[:2]))), False),
     "orthophoto": (_surface_colours, True),
     "grid-geotiff": (_flat_grid, False),
 }

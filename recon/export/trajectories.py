@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.map.store.trees import loop_in
 from recon.odometry.health import segment_numbers
-from recon.places.loop import Loop
 
 _AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
 _POSE: Final = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
@@ -56,19 +55,20 @@ def export_paths(
     write_tum(folder / "trajectory_map_base_tum.txt", based)
     if session.loops.get("closed"):
         write_tum(folder / "trajectory_odometry_tum.txt", session.odometry.select(joined))
-        kinds = ("closed", "refused")
-        loops = {kind: [*map(_edge, map(loop_in, session.loops[kind]))] for kind in kinds}
+        loops = {
+            kind: [
+                {
+                    "first": loop.first,
+                    "last": loop.last,
+                    "inliers": loop.inliers,
+                    "dense_ratio": round(loop.dense_ratio, 4),
+                    "T_first_last": loop.T_first_last.tolist(),
+                }
+                for loop in map(loop_in, session.loops[kind])
+            ]
+            for kind in ("closed", "refused")
+        }
         write_json(folder / "loops.json", loops)
-
-
-def _edge(loop: Loop) -> dict[str, Any]:
-    return {
-        "first": loop.first,
-        "last": loop.last,
-        "inliers": loop.inliers,
-        "dense_ratio": round(loop.dense_ratio, 4),
-        "T_first_last": loop.T_first_last.tolist(),
-    }
 
 
 def export_sessions(map_: MapFile, folder: Path) -> None:

@@ -1,4 +1,7 @@
-"""What frames add to a submap: sums per voxel of the cloud, and log-odds of cells by ray casting.
+"""Submaps, and what frames add to them: sums per voxel of the cloud, log-odds of cells by rays.
+
+A submap is consecutive frames, built in the world of the odometry. Where loop closure moves it, its
+voxels are moved with it, and nothing is matched again.
 
 Occupancy is built from the rays that are kept of each frame, points averaged in small cubes and
 rounded, so that the same map can be built again, and others with other voxels, heights or poses.
@@ -6,16 +9,18 @@ rounded, so that the same map can be built again, and others with other voxels, 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
+from recon.core.geometry.se3 import invert
 from recon.core.kernels import voxels
 from recon.core.settings import Length, Settings
 from recon.core.values import Frame, OccupancyVoxels, PointCloud, RayCloud, RayGrain
-from recon.core.values.arrays import Float32, Float64, Int32
+from recon.core.values.arrays import Float32, Float64
 from recon.core.values.grid import log_odds
 from recon.map.fusion import ALL, FusedPart, FusionSettings, columns_in, sums_in, sums_of
 from recon.map.kernels import clamped, raycast
@@ -26,10 +31,9 @@ _MAX_SIGMA: Final = 6.0  # in voxels: less precise points are left out, they wou
 
 
 class CloudBuilder:
-    """Fuses clouds frame by frame.
+    """Fuses clouds frame by frame; a point weighs ``confidence / sigma²``.
 
-    A point weighs ``confidence / sigma²``. Time per frame grows with its points alone, memory with
-    the number of voxels. The same clouds in the same order give the same map.
+    Time per frame grows with its points alone, memory with the number of voxels.
     """
 
     def __init__(self, settings: FusionSettings) -> None:
@@ -39,7 +43,7 @@ class CloudBuilder:
         self._frames = 0
 
     def __len__(self) -> int:
-        """Return the number of voxels seen by at least one frame."""
+        """Return the number of voxels."""
         return int(self._sums.used[0])
 
     def integrate(self, cloud: PointCloud) -> None:
@@ -48,9 +52,18 @@ class CloudBuilder:
         ``confidence`` None = 1, ``sigma_m`` None = all equally precise. What one of the clouds does
         not have, the map does not have.
         """
-        self._check(cloud)
-        if len(cloud):
-            self._know(tuple(name for name in self._known if name in cloud.arrays))
+        _check_cloud(cloud, "world", "the fused map")
+        limit_m = self._settings.voxel_m * (voxels.KEY_LIMIT - 1)
+        if len(cloud) and np.abs(cloud.xyz).max() > limit_m:
+            raise MappingError(
+                "a point is too far from the origin for this voxel size",
+                got=f"{np.abs(cloud.xyz).max():.0f} m",
+                expected=f"at most {limit_m:.0f} m",
+            )
+        if len(cloud):  # forget what this cloud does not have
+            known = tuple(name for name in self._known if name in cloud.arrays)
+            self._sums = self._sums._replace(sums=sums_of(self._sums.sums, self._known, known))
+            self._known = known
         points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), self._values(cloud))
         self._sums = voxels.add_points(self._sums, points, self._settings.voxel_m, self._frames)
         self._frames += 1
@@ -72,11 +85,6 @@ class CloudBuilder:
         self._known, self._frames = part.known if frames else ALL, frames
         empty = voxels.make_sums(max(1, len(part)), sums_in(self._known) - 4)
         self._sums = voxels.add_rows(empty, part.keys, part.sums, part.information, part.frames)
-
-    def _know(self, known: tuple[str, ...]) -> None:
-        """Forget what one of the clouds does not have."""
-        self._sums = self._sums._replace(sums=sums_of(self._sums.sums, self._known, known))
-        self._known = known
 
     @property
     def nbytes(self) -> int:
@@ -100,17 +108,6 @@ class CloudBuilder:
         for each in columns.keys() & found.keys():
             values[:, columns[each].start - 4 : columns[each].stop - 4] = each.averaged(found[each])
         return values
-
-    def _check(self, cloud: PointCloud) -> None:
-        """Refuse what would silently spoil the map."""
-        _check_cloud(cloud, "world", "the fused map")
-        limit_m = self._settings.voxel_m * (voxels.KEY_LIMIT - 1)
-        if len(cloud) and np.abs(cloud.xyz).max() > limit_m:
-            raise MappingError(
-                "a point is too far from the origin for this voxel size",
-                got=f"{np.abs(cloud.xyz).max():.0f} m",
-                expected=f"at most {limit_m:.0f} m",
-            )
 
 
 _FIRST_POINTS: Final = 1 << 12
@@ -159,7 +156,15 @@ class OccupancyBuilder:
         ``count`` is the number of points that each stands for, None = 1.
         """
         _check_cloud(cloud, "camera", "the occupancy map")
-        _check_pose(T_world_camera, self._settings.resolution_m)
+        if not np.isfinite(T_world_camera).all():
+            raise MappingError("a pose to map is not finite")
+        away_m = float(np.abs(T_world_camera[:3, 3]).max())
+        if away_m > (far_m := self._settings.resolution_m * (voxels.KEY_LIMIT / 2)):
+            raise MappingError(
+                "the camera is too far from the origin for this resolution",
+                got=f"{away_m:.0f} m",
+                expected=f"at most {far_m:.0f} m",
+            )
         rays = frame_rays(cloud, self._T_map_world @ T_world_camera, self._settings)
         self._evidence = raycast.cast_rays(self._evidence, rays, SPREAD_SIGMAS)
         self._points = voxels.add_points(self._points, _hits(rays), 1.0, 0)
@@ -205,7 +210,15 @@ def frame_rays(cloud: PointCloud, T_map_camera: Float64, s: OccupancySettings) -
         s.max_range_m / s.resolution_m,
         FREE_MARGIN_SIGMAS,
     )
-    means, values = _reduce(ends, values, cloud.count, _MIN_POINTS)
+    # Mean ends and values of each voxel with enough trusted points.
+    weights = (values[:, 2] > 0).astype(np.float32)
+    weights = weights if cloud.count is None else weights * cloud.count.astype(np.float32)
+    points = voxels.VoxelPoints(ends, weights, values)
+    sums = voxels.add_points(voxels.make_sums(4096, values.shape[1]), points, 1.0, 0)
+    enough = np.flatnonzero(sums.sums[: sums.used[0], 0] >= _MIN_POINTS)
+    found = sums.sums[enough, 1:] / sums.sums[enough, :1]
+    means = voxels.unpack_keys(sums.keys[enough]) + 0.5 + found[:, :3]
+    values = found[:, 3:]
     sigma, free, confidence, hit = np.ascontiguousarray(values.T)
     return raycast.Rays(
         origin=T[:3, 3].copy(),
@@ -225,20 +238,6 @@ def _hits(rays: raycast.Rays) -> voxels.VoxelPoints:
     return voxels.VoxelPoints(rays.ends[hit], weights, values)
 
 
-def _reduce(
-    ends: Float32, values: Float32, count: Int32 | None, least: int
-) -> tuple[Float64, Float32]:
-    """Return mean ends (M, 3) and values (M, C) of each voxel with ``least`` trusted points."""
-    trusted = (values[:, 2] > 0).astype(np.float32)
-    weights = trusted if count is None else trusted * count.astype(np.float32)
-    points = voxels.VoxelPoints(ends, weights, values)
-    sums = voxels.add_points(voxels.make_sums(4096, values.shape[1]), points, 1.0, 0)
-    enough = np.flatnonzero(sums.sums[: sums.used[0], 0] >= least)
-    means = sums.sums[enough, 1:] / sums.sums[enough, :1]
-    centres = voxels.unpack_keys(sums.keys[enough]) + 0.5
-    return centres + means[:, :3], means[:, 3:]
-
-
 def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:
     """Return both float32 (N,); 0 m and 1 where the cloud has none."""
     n = len(cloud)
@@ -249,23 +248,10 @@ def sigma_and_confidence(cloud: PointCloud) -> tuple[Float32, Float32]:
 
 
 def _check_cloud(cloud: PointCloud, frame: Frame, what: str) -> None:
-    """Refuse a cloud that would silently spoil the map."""
     if cloud.frame != frame:
         raise MappingError(f"{what} takes clouds in {frame} axes", got=cloud.frame, expected=frame)
     if not all(np.isfinite(values).all() for values in cloud.arrays.values()):
         raise MappingError("a point to map is not finite")
-
-
-def _check_pose(T_world_camera: NDArray[Any], resolution_m: float) -> None:
-    if not np.isfinite(T_world_camera).all():
-        raise MappingError("a pose to map is not finite")
-    far_m = resolution_m * (voxels.KEY_LIMIT / 2)
-    if np.abs(T_world_camera[:3, 3]).max() > far_m:
-        raise MappingError(
-            "the camera is too far from the origin for this resolution",
-            got=f"{np.abs(T_world_camera[:3, 3]).max():.0f} m",
-            expected=f"at most {far_m:.0f} m",
-        )
 
 
 _UNITS_PER_CELL: Final = 64
@@ -315,3 +301,48 @@ def thin_rays(cloud: PointCloud, settings: OccupancySettings) -> RayCloud:
 def _beyond_m(settings: OccupancySettings) -> float:
     """Return where points out of range are moved to: never into a cube with one in range."""
     return settings.max_range_m + 2 * settings.resolution_m / RAYS_PER_VOXEL
+
+
+class SubmapSettings(Settings):
+    """Where a drive is divided into submaps, and into which tiles its map.
+
+    Both bound the memory. Apart from rounding they change no result, except where a vehicle turned
+    back and saw something on its own track: whether that came later is known by submaps.
+    """
+
+    length_m: float = Length(25.0, ge=1e-06, le=100_000.0)
+    """Path after which a new submap begins. Shorter ones follow closed loops better and take
+    less memory."""
+    tile_m: float = Length(50.0, ge=1e-06, le=100_000.0)
+    """Edge of the tiles, rounded to whole voxels. Smaller ones take less memory, and more time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """What consecutive frames saw: ``fused`` in world axes, ``occupancy`` in map axes."""
+
+    index: int
+    first_frame: int
+    frames: int
+    fused: FusedPart
+    occupancy: OccupancyPart
+
+    def moved(
+        self, T_corrected_world: Float64, T_map_world: Float64, voxel_m: float, resolution_m: float
+    ) -> Submap:
+        T_corrected_map = T_map_world @ T_corrected_world @ invert(T_map_world)
+        return replace(
+            self,
+            fused=self.fused.moved(T_corrected_world, voxel_m),
+            occupancy=self.occupancy.moved(T_corrected_map, resolution_m),
+        )
+
+    @classmethod
+    def from_tree(cls, tree: dict[str, Any]) -> Submap:
+        return cls(
+            tree["index"],
+            tree["first_frame"],
+            tree["frames"],
+            FusedPart.from_tree(tree["fused"]),
+            OccupancyPart.from_tree(tree["occupancy"]),
+        )

@@ -19,6 +19,7 @@ from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float64, Int64, tree_of
+from recon.map.builders import Submap
 from recon.map.fusion import ALL, FusedPart, row_bytes
 from recon.map.ground.grid import JOINED_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
@@ -26,7 +27,6 @@ from recon.map.occupancy.moving import GROWTH_CELLS
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.settings import DriveSettings
 from recon.map.store.records import Store
-from recon.map.submaps import Submap
 
 FUSED: Final = "fused"  # kind of the parts of the fused cloud in the tiles
 OCCUPANCY: Final = "occupancy"  # kind of the parts of the occupancy
@@ -50,7 +50,6 @@ class Cut:
     nbytes: Counter[tuple[str, TileKey]] = field(default_factory=Counter)
 
     def add(self, submap: Submap) -> None:
-        """Add the next submap, where it was put."""
         self.frames.append(submap.frames)
         self.known &= set(submap.fused.known if len(submap.fused) else ALL)
         columns = submap.occupancy.cells[:, :2]
@@ -145,8 +144,10 @@ class Cutter:
         """
         cut = Cut()
         for place, submap in enumerate(tracked(submaps, "submaps", "cut into tiles")):
-            T = None if T_corrected_world is None else T_corrected_world[place]
-            moved = self._moved(submap, T)
+            moved, config = submap, self._config
+            if T_corrected_world is not None and (T_corrected_world[place] != np.eye(4)).any():
+                sizes_m = (config.fusion.voxel_m, config.occupancy.resolution_m)
+                moved = submap.moved(T_corrected_world[place], self._T_map_world, *sizes_m)
             cut.add(moved)
             for kind, key, part, nbytes in self._pieces(moved, parts):
                 parts.put(kind, key, tree_of(part), first + place)
@@ -159,13 +160,6 @@ class Cutter:
     def centres_m(self, part: OccupancyPart) -> Float64:
         """Return float64 (B, 3), centres of the blocks of a part."""
         return np.asarray((part.blocks + 0.5) * (BLOCK_EDGE * self._config.occupancy.resolution_m))
-
-    def _moved(self, submap: Submap, T_corrected_world: Float64 | None) -> Submap:
-        if T_corrected_world is None or np.array_equal(T_corrected_world, np.eye(4)):
-            return submap
-        config = self._config
-        sizes_m = (config.fusion.voxel_m, config.occupancy.resolution_m)
-        return submap.moved(T_corrected_world, self._T_map_world, *sizes_m)
 
     def _pieces(
         self, submap: Submap, parts: TileParts

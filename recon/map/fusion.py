@@ -40,10 +40,7 @@ class FusionSettings(Settings):
 
 
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
-    """Return the depth at which 0.3 px, ``Z²·error_px / (f·b)``, cost ``max_depth_error_m``.
-
-    Infinity where the settings have no limit.
-    """
+    """Return the depth at which 0.3 px are ``max_depth_error_m``: ``Z²·error_px / (f·b)``."""
     if settings.max_depth_error_m is None:
         return math.inf
     fb = camera.focal_px * camera.baseline_m
@@ -165,7 +162,18 @@ class FusedPart:
         for each, columns in columns_in(self.known).items():
             if each.fused == "direction":
                 sums[:, columns] = rotate(T_new_world, sums[:, columns])
-        return _merged(replace(self, keys=voxels.pack_keys(cells), sums=sums))
+        # One row for each voxel, in the order of the first row of each.
+        keys = voxels.pack_keys(cells)
+        order = np.argsort(keys, kind="stable")
+        begin = np.flatnonzero(np.diff(keys[order], prepend=-1))
+        merged = FusedPart(
+            keys[order][begin],
+            np.add.reduceat(sums[order], begin, axis=0),
+            np.maximum.reduceat(self.information[order], begin),
+            np.maximum.reduceat(self.frames[order], begin),
+            self.known,
+        )
+        return merged.select(np.argsort(order[begin], kind="stable"))
 
     def cloud(self, voxel_m: float, least: int) -> PointCloud:
         """Return one point per voxel that `enough` frames saw, frame ``world``, as first seen.
@@ -173,8 +181,12 @@ class FusedPart:
         ``sigma_m`` treats frames as independent, and the points of one frame in one voxel as one
         measurement. Voxels whose normals cancel are left out.
         """
-        rows = np.flatnonzero(self.enough(least, voxel_m))
-        part = self.select(rows[self._has_direction(rows)])
+        part = self.select(np.flatnonzero(self.enough(least, voxel_m)))
+        for each, columns in columns_in(self.known).items():
+            if each.fused == "direction" and each.name in self.known:
+                # 1e-3: below, the direction is that of rounding errors.
+                length = np.linalg.norm(part.sums[:, columns], axis=1)
+                part = part.select(length > 1e-3 * part.sums[:, 0])
         weight = part.sums[:, :1]
         found: dict[str, Any] = {
             each.name: each.of_means(part.sums[:, columns] / weight)
@@ -207,15 +219,6 @@ class FusedPart:
         precise = self.information >= np.float32((_PRECISE * voxel_m) ** -2)
         return np.asarray(self.frames >= np.where(precise, max(1, least - 1), least))
 
-    def _has_direction(self, rows: NDArray[np.intp]) -> Bool:
-        """Return which voxels have normals that do not cancel; all, where normals are not known."""
-        has, weight = np.ones(len(rows), np.bool_), self.sums[rows, 0]
-        for each, columns in columns_in(self.known).items():
-            if each.fused == "direction" and each.name in self.known:
-                # 1e-3: below, the direction is that of rounding errors.
-                has &= np.linalg.norm(self.sums[rows, columns], axis=1) > 1e-3 * weight
-        return np.asarray(has)
-
 
 def sums_of(sums: Float32, known: tuple[str, ...], wanted: Collection[str]) -> Float32:
     """Return sums (N, 4 + C) with the columns of other attributes, all of them ``known``."""
@@ -241,21 +244,6 @@ def join_fused(parts: Iterable[FusedPart]) -> FusedPart:
         total.keys[:n], total.sums[:n], total.information[:n], total.frames[:n], known
     )
     return found if n else found.knowing(())
-
-
-def _merged(part: FusedPart) -> FusedPart:
-    """Return one row for each voxel, in the order of the first row of each."""
-    order = np.argsort(part.keys, kind="stable")
-    keys = part.keys[order]
-    begin = np.flatnonzero(np.r_[True, keys[1:] != keys[:-1]])
-    merged = FusedPart(
-        keys[begin],
-        np.add.reduceat(part.sums[order], begin, axis=0),
-        np.maximum.reduceat(part.information[order], begin),
-        np.maximum.reduceat(part.frames[order], begin),
-        part.known,
-    )
-    return merged.select(np.argsort(order[begin], kind="stable"))
 
 
 def _rounded(values: Float32, bits: int) -> Float32:

@@ -7,16 +7,15 @@ from typing import Final
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.core.memory import MemorySettings
+from recon.core.machine import MemorySettings
 from recon.core.settings import Length, Settings
-from recon.map.builders import OccupancySettings
+from recon.map.builders import OccupancySettings, SubmapSettings
 from recon.map.fusion import FusionSettings
 from recon.map.ground.axes import AxesSettings
 from recon.map.ground.grid import GridSettings
 from recon.map.ground.surface import GroundSettings
 from recon.map.ground.traverse import RobotSettings
 from recon.map.kernels.raycast import BLOCK_EDGE
-from recon.map.submaps import SubmapSettings
 from recon.odometry.protocol import Odometry
 from recon.odometry.registry import check_odometry
 from recon.odometry.settings import OdometrySettings, RigSettings

@@ -16,14 +16,14 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from typing_extensions import Self
 
 from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.kernels.voxels import are_among, distinct_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
-from recon.core.values.arrays import Bool, Float32, Float64, Int64
+from recon.core.values.arrays import Float32, Float64, Int64
 from recon.core.values.grid import log_odds
+from recon.map.builders import Submap
 from recon.map.cut import FUSED, OCCUPANCY, Cut, Cutter, Rectangle, TileKey, TileParts
 from recon.map.fusion import ALL, FusedPart, join_fused
 from recon.map.ground.surface import find_floors
@@ -32,7 +32,6 @@ from recon.map.occupancy.bodies import FrameObservations
 from recon.map.occupancy.moving import CellEvidence, cell_evidence, find_moved
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
-from recon.map.submaps import Submap
 from recon.stereo.frame import filter_cloud
 
 _POINTS: Final = "points"
@@ -60,7 +59,6 @@ class Tile:
 
     @property
     def voxels(self) -> OccupancyVoxels:
-        """Its observed voxels."""
         return self.tiles.voxels(self.key)
 
 
@@ -72,6 +70,8 @@ class Tiles:
     Attributes:
         extent: Smallest x and y of the cells that submaps observed, and the largest plus one.
         submap_of_frame: int64 (N,), number of the submap of each frame; -1 between two drives.
+        looks: What single frames saw: what they show to have moved is left out of clouds. None = it
+            is not known, and nothing is left out.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Tiles:
         self._parts = TileParts(self.edge_m, path)
         self._chain = DriveChain(self._parts)
         self._known: tuple[str, ...] = ALL
-        self._observations: FrameObservations | None = None
+        self.observations: FrameObservations | None = None
         self.extent: tuple[TileKey, TileKey] = ((0, 0), (0, 0))
         self.submap_of_frame: Int64 = np.zeros(0, np.int64)
 
@@ -134,16 +134,6 @@ class Tiles:
         return tiles if tiles._take(cut, drives) else None
 
     @property
-    def observations(self) -> FrameObservations | None:
-        """What single frames saw, without which nothing is taken out; None = it is not known."""
-        return self._observations
-
-    def with_observations(self, observations: FrameObservations | None) -> Self:
-        """Leave out of clouds what ``observations`` show to have moved; None = nothing."""
-        self._observations = observations
-        return self
-
-    @property
     def resolution_m(self) -> float:
         return self.config.occupancy.resolution_m
 
@@ -177,7 +167,6 @@ class Tiles:
         return join_clouds(PointCloud(**tree, frame="map") for _, tree in found)
 
     def voxels(self, key: TileKey) -> OccupancyVoxels:
-        """Return the observed voxels of a tile, map axes."""
         return self.bounds(key).voxels(self.wide_voxels(key))
 
     def wide_voxels(
@@ -202,12 +191,10 @@ class Tiles:
         return self._chain.changed(key, voxels, inside)
 
     def cloud_in(self, rectangle: Rectangle) -> PointCloud:
-        """Return the points in a rectangle, frame ``map``."""
         clouds = map(self.cloud, self._parts.under(rectangle))
         return join_clouds(cloud.select(rectangle.contains(cloud.xyz)) for cloud in clouds)
 
     def voxels_in(self, rectangle: Rectangle) -> OccupancyVoxels:
-        """Return the voxels with their centres in a rectangle."""
         found = map(self.voxels, self._parts.under(rectangle))
         return join_voxels(map(rectangle.voxels, found), self.resolution_m)
 
@@ -244,11 +231,17 @@ class Tiles:
 
     def _fused(self, key: TileKey) -> tuple[PointCloud, PointCloud]:
         """Return the points of a tile, frame ``map``: the filtered ones, and those that moved."""
-        kept, removed = [], []
+        kept, removed, fusion = [], [], self.config.fusion
         numbered = ((n, FusedPart.from_tree(tree)) for n, tree in self._parts.read(FUSED, key))
         for drive, parts in groupby(numbered, key=self._chain.drive):
             fused = join_fused(part for _, part in parts)
-            moved = self._moved_rows(key, drive, fused)
+            moved = np.zeros(len(fused), np.bool_)
+            if fusion.remove_moving and self.observations is not None:
+                points = apply(self._T_map_world, fused.points(fusion.voxel_m))
+                counted = fused.enough(self._least_frames, fusion.voxel_m)
+                voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
+                sigma_m = fused.frame_sigma_m
+                moved = find_moved(points, sigma_m, counted, voxels, evidence, self.observations)
             kept.append(fused.select(~moved))
             removed.append(fused.select(moved))
         cloud = filter_cloud(self._exported(kept), self.config.map_filters)
@@ -269,17 +262,6 @@ class Tiles:
         placed = transform_cloud(cloud, self._T_map_world, frame="map")
         return placed.select(self.bounds(key).contains(placed.xyz))
 
-    def _moved_rows(self, key: TileKey, drive: int, fused: FusedPart) -> Bool:
-        """Return which rows of what a drive fused in a tile and its margin are of what moved."""
-        fusion = self.config.fusion
-        if not fusion.remove_moving or self._observations is None:
-            return np.zeros(len(fused), np.bool_)
-        points = apply(self._T_map_world, fused.points(fusion.voxel_m))
-        counted = fused.enough(self._least_frames, fusion.voxel_m)
-        voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
-        sigma_m = fused.frame_sigma_m
-        return find_moved(points, sigma_m, counted, voxels, evidence, self._observations)
-
 
 _EVIDENCE: Final = "evidence"
 _OLD: Final = log_odds(0.85)
@@ -297,13 +279,20 @@ class DriveChain:
         self.drive_of: Int64 = np.zeros(0, np.int64)
 
     def drive(self, numbered: tuple[int, Any]) -> int:
-        """Return the drive of what is numbered by submap."""
         return int(self.drive_of[numbered[0]]) if len(self.drive_of) else 0
 
     def joined(self, key: TileKey, *, note: bool) -> OccupancyPart:
         """Join what all drives observed in a tile; ``note`` what each saw, for `evidence`."""
-        drives = self._drives(key)
-        return _outdone(self._noted(key, drives) if note else (part for _, part in drives))
+
+        def seen() -> Iterator[OccupancyPart]:
+            for drive, part in self._drives(key):
+                if note:
+                    cells, evidence = cell_evidence(part)
+                    noted = {"cells": cells, "log_odds": evidence}
+                    self._parts.put(_EVIDENCE, key, noted, drive)
+                yield part
+
+        return _outdone(seen())
 
     def evidence(self, key: TileKey, drive: int) -> CellEvidence:
         """Return the `cell_evidence` of a drive, noted when the tile was joined."""
@@ -324,15 +313,6 @@ class DriveChain:
         kept = seen.select(~are_among(pack_keys(seen.keys >> BLOCK_BITS), changed))
         return join_voxels([kept, anew], seen.resolution_m)
 
-    def _noted(
-        self, key: TileKey, drives: Iterable[tuple[int, OccupancyPart]]
-    ) -> Iterator[OccupancyPart]:
-        """Return the parts of drives, with a note of what each saw."""
-        for drive, part in drives:
-            cells, seen = cell_evidence(part)
-            self._parts.put(_EVIDENCE, key, {"cells": cells, "log_odds": seen}, drive)
-            yield part
-
     def _drives(
         self,
         key: TileKey,
@@ -349,11 +329,13 @@ class DriveChain:
         numbered = merge(own, sorted((after or {}).items()), key=itemgetter(0))
         for drive, parts in groupby(numbered, key=self.drive):
             # Joined one by one, so that a place passed often takes no more memory than others.
-            yield drive, join_occupancy(_in_blocks(part, blocks) for _, part in parts)
-
-
-def _in_blocks(part: OccupancyPart, blocks: Int64 | None) -> OccupancyPart:
-    return part if blocks is None else part.select(are_among(part.rows.blocks, blocks))
+            yield (
+                drive,
+                join_occupancy(
+                    part if blocks is None else part.select(are_among(part.rows.blocks, blocks))
+                    for _, part in parts
+                ),
+            )
 
 
 def _outdone(drives: Iterable[OccupancyPart]) -> OccupancyPart:

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
+from recon.core.geometry.alignment import Problem, minimise
 from recon.core.geometry.se3 import (
     apply,
     as_step,
@@ -20,7 +21,6 @@ from recon.core.geometry.se3 import (
     invert,
     make_transform,
 )
-from recon.core.least_squares import Problem, minimise
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, frozen_array
 from recon.core.values.camera import project

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csc_array
 
+from recon.core.geometry.alignment import Problem, minimise
 from recon.core.geometry.se3 import invert
-from recon.core.least_squares import Problem, minimise
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project

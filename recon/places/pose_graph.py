@@ -39,8 +39,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from recon.core.errors import RegistrationError
+from recon.core.geometry.alignment import Problem, minimise
 from recon.core.geometry.se3 import adjoint, hat, invert
-from recon.core.least_squares import Problem, minimise
 from recon.core.values.arrays import Bool, Float64, freeze
 
 _ROUNDS: Final = 30

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from recon.core.errors import CalibrationError
+from recon.core.geometry.alignment import Problem, minimise
 from recon.core.geometry.se3 import exp_so3, hat
-from recon.core.least_squares import Problem, minimise
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, UInt8

@@ -92,12 +92,18 @@ class RunDirectory:
         write_json(self.path(name), content)
 
     def __enter__(self) -> Self:
-        _refuse_address(self.folder)
+        within = (self.folder, *self.folder.parents)
+        if any(_SCHEME.fullmatch(p.name) and not p.is_dir() for p in within):
+            raise OutputError(
+                "results go into a folder, not to an address",
+                where=self.folder,
+                hint="give a folder of a shared file system, or copy the finished one there",
+            )
         if not self.resumes:
             _refuse_foreign(self.folder)
         refuse_links(self.folder)
         self._earlier = recorded_files(self.folder)
-        self._made = [p for p in (self.folder, *self.folder.parents) if not p.exists()]
+        self._made = [p for p in within if not p.exists()]
         try:
             self._lock = take_lock(
                 lock_file(self.folder),
@@ -154,12 +160,12 @@ class RunDirectory:
         return self._partial
 
     def _publish(self) -> None:
-        if self.whole:
-            self._swap()
-        else:
-            self._move()
-        if self._latest:
-            _link_latest(self.folder)
+        self._swap() if self.whole else self._move()
+        link = self.folder.parent / "latest"
+        if self._latest and (not link.exists() or link.is_symlink()):
+            with suppress(OSError):  # a file system without links: the stamped folder is enough
+                link.unlink(missing_ok=True)
+                link.symlink_to(self.folder.name)
 
     def _move(self) -> None:
         files = [Path(name) for name in self.files()]
@@ -177,19 +183,15 @@ class RunDirectory:
         """Put the new folder in the place of the old one, with files in it that are of no run."""
         try:
             shutil.rmtree(self.content / _STATE, ignore_errors=True)
-            self._keep_others()
+            ours = {self.folder / name for name in self._earlier}
+            for path in self.folder.rglob("*"):  # files that are of no run
+                target = self.content / path.relative_to(self.folder)
+                if path.is_file() and path not in ours and self._partial not in path.parents:
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copy2(path, target, follow_symlinks=False)
             exchange(self.content, resolved(self.folder))
         finally:  # the old folder, or a new one that was interrupted before it took its place
             self._withdraw()
-
-    def _keep_others(self) -> None:
-        """Copy files that are of no run into the new folder."""
-        ours = {self.folder / name for name in self._earlier}
-        for path in self.folder.rglob("*"):
-            target = self.content / path.relative_to(self.folder)
-            if path.is_file() and path not in ours and self._partial not in path.parents:
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy2(path, target, follow_symlinks=False)
 
     def _withdraw(self) -> None:
         for partial in {self._partial, self.content}:
@@ -197,15 +199,6 @@ class RunDirectory:
         for folder in self._made:
             with suppress(OSError):  # not empty: files of others, which stay
                 folder.rmdir()
-
-
-def _refuse_address(folder: Path) -> None:
-    if any(_SCHEME.fullmatch(p.name) and not p.is_dir() for p in (folder, *folder.parents)):
-        raise OutputError(
-            "results go into a folder, not to an address",
-            where=folder,
-            hint="give a folder of a shared file system, or copy the finished one there",
-        )
 
 
 def _refuse_foreign(folder: Path) -> None:
@@ -230,22 +223,14 @@ def recorded_files(folder: Path) -> list[Path]:
         return []
     with reading(path):
         names = json.loads(read_text(path, RECORD_BYTES)).get("files", [])
-        if not isinstance(names, list) or not all(_is_name(name) for name in names):
+        named = isinstance(names, list) and all(
+            isinstance(name, str) and "\0" not in name and os.fsencode(name) != b""
+            for name in names
+        )
+        if not named:
             raise FormatError("record of a run has no valid list of files", where=path)
         inside = (n for n in map(Path, names) if not n.is_absolute() and ".." not in n.parts)
         return [name for name in inside if (folder / name).is_file()]
-
-
-def _is_name(name: object) -> bool:
-    return isinstance(name, str) and "\0" not in name and os.fsencode(name) != b""
-
-
-def _link_latest(folder: Path) -> None:
-    link = folder.parent / "latest"
-    if not link.exists() or link.is_symlink():
-        with suppress(OSError):  # a file system without links: the stamped folder is enough
-            link.unlink(missing_ok=True)
-            link.symlink_to(folder.name)
 
 
 def _unwritable(folder: Path, error: OSError) -> OutputError:

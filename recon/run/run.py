@@ -14,8 +14,7 @@ from typing import Any, Final
 from typing_extensions import Self
 
 from recon.core import progress
-from recon.core.machine import versions
-from recon.core.memory import peak_memory_mb
+from recon.core.machine import peak_memory_mb, versions
 from recon.core.settings import Settings
 from recon.core.work import Stopwatch, use_threads
 from recon.io.fields import write_yaml

@@ -19,7 +19,7 @@ from recon.core.text import counted
 from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.camera import project
-from recon.export.images import open_images
+from recon.export.product import open_images
 from recon.io.files import read_text, reading
 from recon.io.models.mesh import read_mesh
 from recon.map.ground.grid import flatten

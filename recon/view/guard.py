@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import OutputError, require
-from recon.core.memory import return_free_memory
+from recon.core.machine import return_free_memory
 from recon.view.scene import HOST
 
 MOST_PAGES: Final = 8  # that look at a time: each takes a copy of what is shown

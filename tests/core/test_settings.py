@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError, field_validator
 from recon.cli.options import parse_numbers as parse_option
 from recon.commands.config import ReconConfig, load_config
 from recon.core.errors import MissingDependencyError, ReconError, SettingsError, require
-from recon.core.memory import parse_size_mb
+from recon.core.machine import parse_size_mb
 from recon.core.settings import Settings
 from recon.core.text import (
     counted,

@@ -17,12 +17,11 @@ from hypothesis import strategies as st
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core import memory as memory_file
+from recon.core import machine as memory_file
 from recon.core import work as work_file
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
-from recon.core.machine import available_cores
-from recon.core.memory import MemorySettings, parse_size_mb, peak_memory_mb
+from recon.core.machine import MemorySettings, available_cores, parse_size_mb, peak_memory_mb
 from recon.core.values import PointCloud, join_clouds, join_voxels
 from recon.core.work import OneBehind, look_ahead, side_by_side, use_threads
 from recon.map.drive.mapper import SubmapBuilder
@@ -137,7 +136,7 @@ T_MAP_WORLD = make_transform(AXES_MAP_WORLD, np.zeros(3))
 
 def test_the_peak_is_that_of_the_process_alone_and_stays():
     ballast = np.ones(100_000_000)  # 800 MB
-    code = "from recon.core.memory import peak_memory_mb; print(peak_memory_mb())"
+    code = "from recon.core.machine import peak_memory_mb; print(peak_memory_mb())"
     below_mb = float(subprocess.check_output([sys.executable, "-c", code], text=True))
     peak_mb = peak_memory_mb()
     assert peak_mb > ballast.nbytes / 1e6

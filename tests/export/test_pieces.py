@@ -15,13 +15,17 @@ from recon.core.errors import MeshingError, OutputError
 from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
 from recon.export.mesh import cut
 from recon.export.mesh.pieces import export_mesh
-from recon.export.mesh.poisson import MeshSettings
-from recon.export.mesh.voxels import reconstruct_map_surface
+from recon.export.mesh.poisson import MeshSettings, reconstruct_map_surface
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import write_ply
 from recon.map.tiles import Tiles
 from recon.run.directory import RunDirectory
 from tests.map.walls import put_cloud, put_voxels
+
+
+def border(mesh, plane):
+    """Return the open edges (E, 2, 3) of a mesh in a plane."""
+    return mesh.vertices[cut.open_corners(mesh, plane)[:, :2]]
 
 
 def sheet(seed: int, n: int = 24, shift_m: float = 0.0, noise_m: float = 0.0) -> TriangleMesh:
@@ -60,7 +64,7 @@ def test_the_halves_are_the_whole(axis, at, seed):
     for half in halves:
         assert (ups(half)[:, 2] > -1e-9).all()
         assert set(np.unique(half.faces)) == set(range(len(half.vertices)))
-    borders = [np.unique(cut.open_edges(half, plane).reshape(-1, 3), axis=0) for half in halves]
+    borders = [np.unique(border(half, plane).reshape(-1, 3), axis=0) for half in halves]
     np.testing.assert_array_equal(borders[0], borders[1])
 
 
@@ -83,7 +87,7 @@ def test_a_mesh_on_one_side_is_kept_or_dropped_whole(above):
 
 def gaps_m(one: TriangleMesh, other: TriangleMesh, plane: cut.Plane) -> np.ndarray:
     """How far points along each border are from the other border."""
-    borders, found = [cut.open_edges(mesh, plane) for mesh in (one, other)], []
+    borders, found = [border(mesh, plane) for mesh in (one, other)], []
     along = np.linspace(0, 1, 7, dtype=np.float32)[None, :, None]
     for here, there in (borders, borders[::-1]):
         points = here[:, :1] * (1 - along) + here[:, 1:] * along
@@ -97,7 +101,7 @@ def test_a_seam_between_two_versions_of_a_surface_is_closed(n):
     left = cut.cut_mesh(sheet(2), plane, keep_above=False)
     right = cut.cut_mesh(sheet(3, n, shift_m=0.02, noise_m=0.005), plane, keep_above=True)
     assert gaps_m(left, right, plane).max() > 0.01
-    closed = cut.close_seam(right, plane, cut.open_edges(left, plane), 0.2)
+    closed = cut.close_seam(right, plane, border(left, plane), 0.2)
     # Both ends of the seam lie where the sheets end, up to 0.02 m apart.
     assert gaps_m(_within(left, 0.9), _within(closed, 0.9), plane).max() < 1e-5
     assert area_m2(closed) == pytest.approx(area_m2(right), rel=0.02)
@@ -114,7 +118,7 @@ def test_a_seam_whose_neighbour_is_far_stays_as_it_is():
     plane = cut.Plane(0, 0.0)
     left = cut.cut_mesh(sheet(2), plane, keep_above=False)
     right = cut.cut_mesh(sheet(3, shift_m=1.0), plane, keep_above=True)
-    closed = cut.close_seam(right, plane, cut.open_edges(left, plane), 0.2)
+    closed = cut.close_seam(right, plane, border(left, plane), 0.2)
     np.testing.assert_array_equal(closed.vertices, right.vertices)
     np.testing.assert_array_equal(closed.faces, right.faces)
 

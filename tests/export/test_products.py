@@ -16,7 +16,7 @@ from recon.core.values.arrays import Float64
 from recon.export.cloud import CloudSample
 from recon.export.costmap import make_costmap
 from recon.export.make import Products, make
-from recon.export.occupancy import make_grid
+from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext
 from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply, write_ply_tiles
@@ -132,7 +132,7 @@ def test_a_scene_of_any_size_has_a_grid_and_a_vehicle_only_where_it_fits(scale, 
     small = replace(drive.calibration, baseline_m=scale * drive.calibration.baseline_m)
     config = load_config(None, ["fusion.min_count=1", f"grid.vehicle_width_m={width_m}"])
     made = map_sequence(drive.with_calibration(small), config.at_scale(scale))
-    grid, _, warnings = make_grid(made.placed)
+    grid, _, warnings = Flattening(made.placed).grid()
     assert (grid.cells == FREE).any() == (scale == 0.08)  # heights are those of robots
     if said is not None:
         assert any(said in text for text in warnings)
@@ -178,7 +178,7 @@ def test_an_empty_height_band_and_a_grid_that_a_far_pose_makes_too_large_are_ref
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
     path_m[-1] = (1e4, 1e4, 0.0)
     with pytest.raises(MappingError, match="grid would be too large"):
-        make_grid(PlacedMap(mapped.tiles, path_m, np.ones(len(path_m), bool)))
+        Flattening(PlacedMap(mapped.tiles, path_m, np.ones(len(path_m), bool))).grid()
 
 
 def _random_cloud(seed: int, points: int) -> PointCloud:

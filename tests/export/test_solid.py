@@ -11,9 +11,8 @@ from recon.commands.config import PAIR_DEFAULTS, load_config
 from recon.commands.pair import run_pair
 from recon.core.errors import MeshingError, SettingsError
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
-from recon.export.mesh.grid import mesh_grid
+from recon.export.mesh.grid import closed_behind, mesh_grid
 from recon.export.mesh.poisson import MeshSettings
-from recon.export.mesh.solid import closed_behind
 from recon.io.models.mesh import write_mesh
 from recon.sources.one_pair import read_pair_input
 from tests.scenery.middlebury import write_scene

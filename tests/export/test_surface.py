@@ -12,9 +12,9 @@ from recon.core.errors import MeshingError
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.camera import project
-from recon.export.mesh.coverage import mesh_coverage
 from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.poisson import MeshSettings, _fitting_depth, reconstruct_mesh
+from recon.export.pair import mesh_coverage
 from recon.export.pymeshlab import screened_poisson
 
 

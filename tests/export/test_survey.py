@@ -10,7 +10,7 @@ from recon.core.errors import EvaluationError, FormatError, ReconError, Settings
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.export.survey import ground_points
+from recon.export.cloud import ground_points
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.surface import GroundSurface
 from recon.map.map import Map

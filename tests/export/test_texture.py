@@ -11,11 +11,10 @@ from recon.core.errors import MeshingError
 from recon.core.geometry.se3 import T_YUP_FRAME, apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera, TriangleMesh
 from recon.core.values.camera import project, unproject
-from recon.export.images import DriveImages
 from recon.export.mesh.charts import make_atlas, ratios_of, texels_of
 from recon.export.mesh.cut import vertex_normals
-from recon.export.mesh.texture import textured_mesh
-from recon.export.mesh.views import PosedImage
+from recon.export.mesh.texture import PosedImage, textured_mesh
+from recon.export.product import DriveImages
 from recon.io.images.image import write_image
 from recon.io.models.mlp import Photo, write_mlp
 
@@ -145,7 +144,7 @@ class Drawn(DriveImages):
 
 
 def test_images_that_fit_into_memory_are_read_once(monkeypatch):
-    monkeypatch.setattr("recon.export.images._KEPT_BYTES", 250)
+    monkeypatch.setattr("recon.export.product._KEPT_BYTES", 250)
     read, placed = [], np.array([False, True, True, False, True])
 
     def frames(start):

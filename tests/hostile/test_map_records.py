@@ -17,7 +17,7 @@ from recon.io.models.octomap import read_octomap
 from recon.look.fault import NAMES
 from recon.look.fit import FittedFault
 from recon.look.rig import RefinedRig
-from recon.map.builders import OccupancySettings, ray_grain
+from recon.map.builders import OccupancySettings, Submap, ray_grain
 from recon.map.fusion import FusedPart, join_fused
 from recon.map.kernels.clamped import CellRows
 from recon.map.map import Map
@@ -26,7 +26,6 @@ from recon.map.store.map_file import MapViews
 from recon.map.store.records import Key, Store
 from recon.map.store.session import OPTIMISED_POSES, POSES_BEFORE_LINKS, SessionInfo
 from recon.map.store.trees import Link
-from recon.map.submaps import Submap
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.fixes import Fixes

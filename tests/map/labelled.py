@@ -19,21 +19,24 @@ ROW = """    Attribute(
     ),
 )  # fmt: skip"""
 CHANGES = {
-    "recon.core.values.attributes": (")  # fmt: skip", ROW),
-    "recon.core.values.cloud": (
-        '    frame: Frame = "camera"',
-        '    label: UInt8 | None = None\n    frame: Frame = "camera"',
-    ),
+    "recon.core.values.cloud": [
+        (")  # fmt: skip", ROW),
+        (
+            '    frame: Frame = "camera"',
+            '    label: UInt8 | None = None\n    frame: Frame = "camera"',
+        ),
+    ],
 }
 LOW, HIGH = 2, 5  # labels of the lower and of the upper half of the wall
 
 
 class Changed(machinery.SourceFileLoader):
     def get_code(self, fullname: str) -> CodeType:
-        before, after = CHANGES[fullname]
         source = self.get_source(fullname) or ""
-        assert source.count(before) == 1
-        return compile(source.replace(before, after), self.path, "exec", dont_inherit=True)
+        for before, after in CHANGES[fullname]:
+            assert source.count(before) == 1
+            source = source.replace(before, after)
+        return compile(source, self.path, "exec", dont_inherit=True)
 
 
 class Finder:
@@ -58,7 +61,7 @@ def main(folder: Path) -> None:
     from recon.io.models.ply import read_ply, write_ply
     from recon.io.models.ros_bag import header, points
     from recon.map.map import Map
-    from recon.map.store.finished import keep_map
+    from recon.map.sessions.copying import keep_map
     from recon.stereo.frame import voxel_downsample
     from recon.view.scene import COLOURINGS, Points, colours
     from tests.map import walls

@@ -16,8 +16,7 @@ from recon.core.errors import FormatError, ShapeError
 from recon.core.values import ATTRIBUTES, Attribute, PointCloud
 from recon.io.models.columns import columns_of
 from recon.map.map import Map
-from recon.map.store import database
-from recon.map.store.finished import keep_map
+from recon.map.sessions.copying import keep_map
 from tests.map import walls
 
 LABEL = Attribute("label", np.uint8, fused="vote", values=4)
@@ -101,9 +100,6 @@ def test_points_of_a_map_say_which_are_inferred_where_they_were_asked_for(monkey
     sure = np.abs(cloud.xyz[:, 2]) > 0.1  # a voxel; else one has points of both halves
     np.testing.assert_array_equal(cloud.inferred[sure], cloud.xyz[sure, 2] > 0)
     assert low <= 1  # what was inferred is above, and in no ray
-    monkeypatch.setattr(database, "FORMAT", 1)
-    with pytest.raises(FormatError, match="format 2"):
-        Map.open(tmp_path / "map.recon")
 
 
 def test_a_colour_is_three_columns_or_the_bits_of_one():
@@ -142,15 +138,10 @@ def test_with_a_row_more_a_label_goes_from_points_through_the_map_into_files_and
 
 
 @pytest.mark.slow
-def test_such_a_map_is_of_format_2_and_is_refused_by_who_does_not_know_the_label(
-    labelled, monkeypatch
-):
+def test_such_a_map_is_refused_by_who_does_not_know_the_label(labelled):
     with Map.open(labelled / "map.recon") as map_, pytest.raises(FormatError) as refused:
         list(map_.session().submaps)
     assert "attribute that this version does not know" in str(refused.value)
     assert "label" in str(refused.value)
     with Map.open(labelled / "map.recon") as map_:  # what was mapped without
         assert len(map_.session(1).submaps[0].fused) > 0
-    monkeypatch.setattr(database, "FORMAT", 1)
-    with pytest.raises(FormatError, match=r"newer version of recon \(got format 2"):
-        Map.open(labelled / "map.recon")

@@ -11,7 +11,7 @@ from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, join
 from recon.core.values.arrays import Float64, tree_of
 from recon.core.values.camera import depth_sigma
 from recon.map import fusion
-from recon.map.builders import CloudBuilder, OccupancyBuilder
+from recon.map.builders import CloudBuilder, OccupancyBuilder, Submap, SubmapSettings
 from recon.map.cut import Rectangle
 from recon.map.drive import mapper as mapper_file
 from recon.map.drive.mapper import SubmapBuilder
@@ -21,7 +21,6 @@ from recon.map.kernels.raycast import BLOCK_BITS
 from recon.map.map import Map
 from recon.map.occupancy.part import free_part, join_occupancy
 from recon.map.store.session import Submaps
-from recon.map.submaps import Submap, SubmapSettings
 from recon.map.tiles import Tiles
 from recon.stereo.frame import filter_cloud
 from tests.map.walls import (

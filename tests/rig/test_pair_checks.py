@@ -20,7 +20,7 @@ from recon.core.values import (
     StereoCalibration,
     StereoPair,
 )
-from recon.export.mesh.coverage import check_coverage
+from recon.export.pair import check_coverage
 from recon.rig.audit import check_found
 from recon.sources.one_pair import PairInput
 from recon.stereo.support import Support

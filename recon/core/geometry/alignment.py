@@ -1,9 +1,10 @@
-"""Alignment of points and trajectories by least squares; poses and numbers between others."""
+"""Least squares: alignment of points and trajectories, and the loop of non-linear fits."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,3 +143,51 @@ def nearest_sorted(numbers: NDArray[Any], others: NDArray[Any]) -> Int32:
     before = np.maximum(after - 1, 0)
     earlier = np.abs(numbers - others[before]) <= np.abs(others[after] - numbers)
     return np.where(earlier, before, after).astype(np.int32)
+
+
+State = TypeVar("State")
+Linear = TypeVar("Linear")
+
+_MORE, _LESS = 10.0, 0.1  # factors of the damping after a step that fails or succeeds
+_LEAST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e12
+
+
+@dataclass(frozen=True)
+class Problem(Generic[State, Linear]):
+    """What is fitted."""
+
+    # gives the cost of a state; NaN or infinite where it is impossible
+    cost: Callable[[State], float]
+    linearise: Callable[[State], Linear]  # gives the normal equations at a state
+    # gives the state after a step with so much damping; None = impossible
+    step: Callable[[State, Linear, float], State | None]
+
+
+def minimise(
+    problem: Problem[State, Linear],
+    start: State,
+    *,
+    rounds: int,
+    min_gain: float,
+    damping: float = 1e-3,
+) -> State:
+    """Minimise a cost, finite at ``start``, by damped Gauss-Newton steps that each must lower it.
+
+    At most ``rounds`` steps are tried; one that gains less than ``min_gain`` of it is the last.
+    ``damping`` is the first, relative to the diagonal of the normal equations.
+    """
+    state, lowest, linear = start, problem.cost(start), problem.linearise(start)
+    for _ in range(rounds):
+        trial = problem.step(state, linear, damping)
+        trial_cost = float("inf") if trial is None else problem.cost(trial)
+        if trial is None or not trial_cost < lowest:  # also where it is NaN
+            damping *= _MORE
+            if damping > _LARGEST_DAMPING:
+                break
+            continue
+        gain = (lowest - trial_cost) / lowest
+        state, lowest, damping = trial, trial_cost, max(damping * _LESS, _LEAST_DAMPING)
+        if gain < min_gain:
+            break
+        linear = problem.linearise(state)
+    return state

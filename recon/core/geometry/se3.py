@@ -78,16 +78,13 @@ def exp_so3(w: NDArray[Any]) -> Float64:
     vectors = np.asarray(w, dtype=np.float64)
     K = hat(vectors)
     angles = np.sqrt(vectors[..., None, :] @ vectors[..., :, None])
-    factors = np.array([_rodrigues(angle) for angle in angles.ravel().tolist()])
-    a, b = factors.T.reshape(2, *angles.shape)
+    # How much the cross-product matrix counts, and its square.
+    factors = [
+        (1.0, 0.5) if w < 1e-8 else (math.sin(w) / w, (1.0 - math.cos(w)) / w**2)
+        for w in angles.ravel().tolist()
+    ]
+    a, b = np.array(factors).T.reshape(2, *angles.shape)
     return np.asarray(np.eye(3) + a * K + b * K @ K)
-
-
-def _rodrigues(angle: float) -> tuple[float, float]:
-    """Return what the cross-product matrix counts, and its square."""
-    if angle < 1e-8:
-        return 1.0, 0.5
-    return math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
 
 
 def log_so3(R: NDArray[Any]) -> Float64:
@@ -128,10 +125,7 @@ def step_jacobian(xyz: NDArray[Any]) -> Float64:
 
 
 def adjoint(T_a_b: NDArray[Any]) -> Float64:
-    """Return the matrix that turns a step in the axes of b into the same motion in a's.
-
-    (6, 6) of a transform (4, 4), (…, 6, 6) of a stack.
-    """
+    """Return (…, 6, 6) that turns a step in the axes of b into the same motion in a's."""
     R, t = T_a_b[..., :3, :3], T_a_b[..., :3, 3]
     matrix = np.zeros((*T_a_b.shape[:-2], 6, 6))
     matrix[..., :3, :3] = matrix[..., 3:, 3:] = R

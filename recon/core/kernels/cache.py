@@ -54,8 +54,7 @@ def note_compiling() -> None:
 def cache_parent() -> Path:
     """The folder of the cache: ``NUMBA_CACHE_DIR``, else beside the sources, else in home.
 
-    Where the sources cannot be written, as in a system-wide installation, it is the user's cache
-    folder; a user without one, as in a container, gets a folder for temporary files.
+    A user without a home, as in a container, gets a folder for temporary files.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
@@ -66,17 +65,10 @@ def cache_parent() -> Path:
         return beside
     # Unlike those of Path, these functions take no home and one of somebody else for what they are.
     users = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111
-    return users / "recon" if users.is_absolute() and _may_make(users) else _temporary()
-
-
-def _may_make(folder: Path) -> bool:
-    """Return whether a folder can be written, or made where its nearest parent is."""
-    nearest = next(path for path in (folder, *folder.parents) if os.path.exists(path))  # noqa: PTH110
-    return os.access(nearest, os.W_OK)
-
-
-def _temporary() -> Path:
-    """Return a folder that is this user's alone: machine code of others must not run."""
+    nearest = next(path for path in (users, *users.parents) if os.path.exists(path))  # noqa: PTH110
+    if users.is_absolute() and os.access(nearest, os.W_OK):
+        return users / "recon"
+    # A folder that is this user's alone: machine code of others must not run.
     user = os.getuid()  # elsewhere than on POSIX there is always a home
     folder = Path(tempfile.gettempdir()) / f"recon-{user}"
     with suppress(FileExistsError):
@@ -88,11 +80,7 @@ def _temporary() -> Path:
 
 
 def cache_folder(parent: Path, source: Path, package: Path = PACKAGE) -> Path:
-    """Return the folder for a file of kernels as it and its imports are; earlier ones are removed.
-
-    Raises:
-        OSError: A file cannot be read.
-    """
+    """Return the folder for a file of kernels and its imports as they are; others are removed."""
     digest = hashlib.sha256()
     for path in with_imports(source, package):
         digest.update(_read(path))

@@ -1,10 +1,8 @@
 """Immutable data types: validated on construction, numpy only; no file access, no drawing.
 
-What a notebook shows of them is made by layers above, on demand (`recon.core.shown`).
+What a notebook shows of them is made by layers above, on demand (`recon.core.lazy`).
 """
 
-from recon.core.values.attributes import ATTRIBUTES as ATTRIBUTES
-from recon.core.values.attributes import Attribute as Attribute
 from recon.core.values.camera import LARGEST_CENTRE_OFFSET as LARGEST_CENTRE_OFFSET
 from recon.core.values.camera import CameraIntrinsics as CameraIntrinsics
 from recon.core.values.camera import LensModel as LensModel
@@ -16,6 +14,8 @@ from recon.core.values.camera import check_side_by_side as check_side_by_side
 from recon.core.values.camera import check_size as check_size
 from recon.core.values.camera import check_unsized as check_unsized
 from recon.core.values.camera import other_size as other_size
+from recon.core.values.cloud import ATTRIBUTES as ATTRIBUTES
+from recon.core.values.cloud import Attribute as Attribute
 from recon.core.values.cloud import Frame as Frame
 from recon.core.values.cloud import PointCloud as PointCloud
 from recon.core.values.cloud import RayCloud as RayCloud
@@ -36,7 +36,7 @@ from recon.core.values.image import Rectified as Rectified
 from recon.core.values.image import RectifiedImage as RectifiedImage
 from recon.core.values.image import RectifiedPair as RectifiedPair
 from recon.core.values.image import StereoPair as StereoPair
-from recon.core.values.imu import ImuRecord as ImuRecord
+from recon.core.values.trajectory import ImuRecord as ImuRecord
 from recon.core.values.trajectory import Trajectory as Trajectory
 from recon.core.values.truth import DepthMetrics as DepthMetrics
 from recon.core.values.truth import DisparityMetrics as DisparityMetrics

@@ -68,7 +68,6 @@ class CalibrationBoard:
 
     @property
     def squares(self) -> tuple[int, int]:
-        """Number of squares along x and y."""
         return self.inner[0] + 1, self.inner[1] + 1
 
     @property

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.shown import Shown
+from recon.core.lazy import Shown
 from recon.core.text import counted
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, freeze, size_text
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
-from recon.core.shown import Shown
+from recon.core.lazy import Shown
 from recon.core.values.arrays import (
     Bool,
     Float32,
@@ -226,8 +226,8 @@ class Disparity(Shown):
             raise ShapeError("sigma_px of a match is not a number above 0")
         return cls(
             values=np.where(valid, found, np.float32(np.nan)),
-            confidence=_where(valid, sure, 0.0),
-            sigma_px=_where(valid, sigma, np.nan),
+            confidence=_put(np.zeros(found.shape, np.float32), np.flatnonzero(valid), sure),
+            sigma_px=_put(np.full(found.shape, np.nan, np.float32), np.flatnonzero(valid), sigma),
             reason=np.where(valid, np.uint8(Reason.VALID), np.uint8(Reason.AMBIGUOUS)),
         )
 
@@ -312,13 +312,7 @@ Recorded = StereoPair | RectifiedImage
 """What a source delivers of a frame."""
 
 
-def _where(mask: Bool, inside: Float32, outside: float) -> Float32:
-    filled = np.full(mask.shape, outside, dtype=np.float32)
-    filled[mask] = inside
-    return filled
-
-
-def _put(array: NDArray[Any], places: NDArray[np.intp], value: float) -> NDArray[Any]:
+def _put(array: NDArray[Any], places: NDArray[np.intp], value: ArrayLike) -> NDArray[Any]:
     changed: NDArray[Any] = array.copy()
     changed.flat[places] = value
     return changed

@@ -49,30 +49,27 @@ class DisparityTruth:
         """Build a ground truth from an array (H, W), any real dtype, pixels; above 0 = known.
 
         ``nonocc`` is bool (H, W), True where both cameras see the point, or the levels of a mask of
-        Middlebury, 255 there; None = both see everything. Others are a `ShapeError`.
+        Middlebury (255 there, 128 = occluded); None = both see everything. Others are a
+        `ShapeError`.
         """
         found = float_map("truth", values)
-        known = np.isfinite(found) & (found > 0)
-        seen = known if nonocc is None else known & _seen_by_both(nonocc, found.shape)
+        seen = known = np.isfinite(found) & (found > 0)
+        if nonocc is not None:
+            mask = np.asarray(nonocc)
+            shown = mask if mask.dtype == np.bool_ else mask == _SEEN_BY_BOTH
+            if mask.shape != found.shape or (mask.dtype != np.bool_ and not shown.any()):
+                raise ShapeError(
+                    "nonocc is no mask of the truth",
+                    got=f"{mask.dtype} {mask.shape}",
+                    expected=f"bool {found.shape}, or levels, {_SEEN_BY_BOTH} where both see",
+                )
+            seen = known & shown
         return cls(np.where(known, found, np.float32(np.nan)), seen)
 
     def __repr__(self) -> str:
         known, seen = (100 * float(np.mean(m)) for m in (np.isfinite(self.values), self.nonocc))
         ratios = f"{known:.1f} % known, {seen:.1f} % not occluded"
         return f"DisparityTruth({size_text(self.values)}, {range_text(self.values)}{ratios})"
-
-
-def _seen_by_both(mask: ArrayLike, shape: tuple[int, ...]) -> Bool:
-    """Return bool (H, W), from truth values or from Middlebury's levels (128 = occluded)."""
-    levels = np.asarray(mask)
-    seen = levels if levels.dtype == np.bool_ else levels == _SEEN_BY_BOTH
-    if levels.shape != shape or (levels.dtype != np.bool_ and not seen.any()):
-        raise ShapeError(
-            "nonocc is no mask of the truth",
-            got=f"{levels.dtype} {levels.shape}",
-            expected=f"bool {shape}, or levels with {_SEEN_BY_BOTH} where both cameras see",
-        )
-    return np.asarray(seen)
 
 
 @dataclass(frozen=True, eq=False)

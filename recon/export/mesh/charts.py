@@ -110,7 +110,6 @@ def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:
 
 
 def _laid_out(mesh: TriangleMesh, facing: Int64, pairs: Int64, texel_m: float) -> Atlas:
-    """Return the atlas with texels of a size."""
     middles = mesh.vertices[mesh.faces].mean(axis=1)
     block = np.floor(middles / (_BLOCK_PX * texel_m)).astype(np.int64)
     one, other = pairs.T

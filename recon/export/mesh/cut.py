@@ -51,14 +51,15 @@ def cut_mesh(mesh: TriangleMesh, plane: Plane, *, keep_above: bool) -> TriangleM
     a, b, c, d = np.split(new, np.cumsum([len(one), len(one), len(two)]))
     split = ((one[:, 0], a, b), (two[:, 0], two[:, 1], c), (two[:, 0], c, d))
     faces = np.concatenate([whole, *(np.stack(corners, axis=1) for corners in split)])
-    return with_faces(_with_cuts(mesh, edges, away, plane), faces.astype(np.int32))
+    first, last = edges.T
+    ratio = (away[first] / (away[first] - away[last])).astype(np.float64)
+    met = between(mesh.vertices, edges, ratio).astype(np.float32)
+    met[:, plane.axis] = np.float32(plane.at_m)
+    return with_faces(with_vertices(mesh, met, edges, ratio), faces.astype(np.int32))
 
 
 def with_vertices(mesh: TriangleMesh, new: Float32, edges: Int32, ratio: Float64) -> TriangleMesh:
-    """Add vertices (N, 3), which no face uses yet, on edges (N, 2), at shares from 0 to 1 of them.
-
-    Normals and colours are interpolated along the edges.
-    """
+    """Add vertices (N, 3) at fractions of edges (N, 2); normals and colours are interpolated."""
     normals, rgb = mesh.normals, mesh.rgb
     if normals is not None:
         mixed = between(normals, edges, ratio)
@@ -84,15 +85,6 @@ def _first_turned(faces: Int32, inside: Bool, corners: int) -> Int32:
     return np.asarray(np.take_along_axis(faces, order, axis=1), dtype=np.int32)
 
 
-def _with_cuts(mesh: TriangleMesh, edges: Int32, away: Float32, plane: Plane) -> TriangleMesh:
-    """Return the mesh with a new vertex where each edge (E, 2) meets the plane."""
-    first, last = edges.T
-    ratio = (away[first] / (away[first] - away[last])).astype(np.float64)
-    new = between(mesh.vertices, edges, ratio).astype(np.float32)
-    new[:, plane.axis] = np.float32(plane.at_m)
-    return with_vertices(mesh, new, edges, ratio)
-
-
 def with_faces(mesh: TriangleMesh, faces: Int32) -> TriangleMesh:
     """Return the faces with the vertices that they use; degenerate faces of a cut are dropped."""
     a, b, c = faces.T
@@ -111,18 +103,8 @@ class OnEdges(NamedTuple):
     distance_m: Float64  # of these from the points
 
 
-def open_edges(mesh: TriangleMesh, plane: Plane) -> Float32:
-    """Return boundary edges of a mesh that lie in a plane: float32 (E, 2, 3)."""
-    return np.asarray(mesh.vertices[_open_corners(mesh, plane)[:, :2]])
-
-
-def open_faces(mesh: TriangleMesh, plane: Plane) -> Int32:
-    """Return int32 (E,), the face that each of the `open_edges` is of."""
-    return np.asarray(_open_corners(mesh, plane)[:, 3])
-
-
 def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float) -> TriangleMesh:
-    """Fit a mesh to the border (E, 2, 3) of its neighbour (`open_edges`), cut along the same plane.
+    """Fit a mesh to the border (E, 2, 3) of its neighbour, cut along the same plane.
 
     The vertices of the mesh move onto the border, and those of the border are inserted into the
     mesh, so that both follow the same line; gaps wider than ``reach_m`` stay.
@@ -135,7 +117,26 @@ def close_seam(mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
     vertices = mesh.vertices.copy()
     vertices[rows[near]] = found.feet[near]
     vertices[rows[near], plane.axis] = np.float32(plane.at_m)
-    return _with_inserted(replace(mesh, vertices=vertices), plane, border, reach_m)
+    mesh = replace(mesh, vertices=vertices)
+    corners = open_corners(mesh, plane)
+    if not len(corners):
+        return mesh
+    # The vertices of the border go into the boundary edges that they lie next to.
+    points = np.unique(border.reshape(-1, 3), axis=0)
+    ends = mesh.vertices[corners[:, :2]]
+    found = nearest_on_edges(points, ends)
+    to_ends_m = np.linalg.norm(points[:, None] - ends[found.edge], axis=2).min(axis=1)
+    inside = (found.distance_m <= reach_m) & (found.ratio > 0) & (found.ratio < 1)
+    inside &= to_ends_m > _SAME_M
+    # In a triangle with two boundary edges, only the first takes new vertices.
+    _, first = np.unique(corners[:, 3], return_index=True)
+    inside &= np.isin(found.edge, first)
+    chosen = np.flatnonzero(inside)
+    chosen = chosen[np.lexsort((found.ratio[chosen], found.edge[chosen]))]
+    new = (len(mesh.vertices) + np.arange(len(chosen))).astype(np.int32)
+    edges = corners[found.edge[chosen], :2].astype(np.int32)
+    grown = with_vertices(mesh, points[chosen], edges, found.ratio[chosen])
+    return replace(grown, faces=_split_faces(mesh.faces, corners, found.edge[chosen], new))
 
 
 def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
@@ -155,30 +156,6 @@ def nearest_on_edges(points: Float32, edges: Float32) -> OnEdges:
     return OnEdges(edge, ratio[row, best], feet[row, best], distance_m[row, best])
 
 
-def _with_inserted(
-    mesh: TriangleMesh, plane: Plane, border: Float32, reach_m: float
-) -> TriangleMesh:
-    """Insert the vertices of a border into the boundary edges that they lie next to."""
-    corners = _open_corners(mesh, plane)
-    if not len(corners):
-        return mesh
-    points = np.unique(border.reshape(-1, 3), axis=0)
-    ends = mesh.vertices[corners[:, :2]]
-    found = nearest_on_edges(points, ends)
-    to_ends_m = np.linalg.norm(points[:, None] - ends[found.edge], axis=2).min(axis=1)
-    inside = (found.distance_m <= reach_m) & (found.ratio > 0) & (found.ratio < 1)
-    inside &= to_ends_m > _SAME_M
-    # In a triangle with two boundary edges, only the first takes new vertices.
-    _, first = np.unique(corners[:, 3], return_index=True)
-    inside &= np.isin(found.edge, first)
-    chosen = np.flatnonzero(inside)
-    chosen = chosen[np.lexsort((found.ratio[chosen], found.edge[chosen]))]
-    new = (len(mesh.vertices) + np.arange(len(chosen))).astype(np.int32)
-    edges = corners[found.edge[chosen], :2].astype(np.int32)
-    grown = with_vertices(mesh, points[chosen], edges, found.ratio[chosen])
-    return replace(grown, faces=_split_faces(mesh.faces, corners, found.edge[chosen], new))
-
-
 def _split_faces(faces: Int32, corners: Int32, edge: Places, new: Int32) -> Int32:
     """Split faces with new vertices on boundary edges, ascending, into fans."""
     kept = np.ones(len(faces), dtype=bool)
@@ -192,7 +169,7 @@ def _split_faces(faces: Int32, corners: Int32, edge: Places, new: Int32) -> Int3
     return np.concatenate([faces[kept], *fans])
 
 
-def _open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
+def open_corners(mesh: TriangleMesh, plane: Plane) -> Int32:
     """Return boundary edges in a plane, int32 (E, 4): ends, third vertex and number of the face."""
     held = plane.holds(mesh.vertices)
     rows = np.flatnonzero(held[mesh.faces].sum(axis=1) >= 2).astype(np.int32)
@@ -221,10 +198,7 @@ def drop_small_components(vertices: Float32, faces: Int32, min_faces: int) -> tu
 
 
 def component_labels(faces: Int32) -> tuple[Int32, Int32]:
-    """Return int32 (F,), the component of each face, joined by edges, and int32 (C,), their sizes.
-
-    They are numbered by their first faces.
-    """
+    """Return int32 (F,), component of each face, in order of first faces; their sizes (C,)."""
     labels = components(meeting_sides(faces) // 3, len(faces))
     return labels, np.bincount(labels).astype(np.int32)
 
@@ -257,7 +231,6 @@ def vertex_normals(vertices: Float32, faces: Int32) -> Float32:
 
 
 def _without_loose(vertices: Float32, faces: Int32) -> tuple[Float32, Int32]:
-    """Drop the vertices that no face uses and renumber the rest."""
     if len(faces) == 0:
         hint = "raise mesh.max_depth or mesh.max_distance_spacings, or filter less"
         raise MeshingError("trimming left no face of the surface", hint=hint)

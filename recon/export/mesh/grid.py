@@ -19,7 +19,6 @@ from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Bool, Float64, Int32, Int64
 from recon.export.mesh.cut import components, meeting_sides, renumbered, vertex_normals
 from recon.export.mesh.poisson import MeshSettings, simplified, usable
-from recon.export.mesh.solid import closed_behind
 
 _SQUARE: Final = 64
 """Grid steps along the legs of the largest triangles; a power of two."""
@@ -61,7 +60,6 @@ class _Grid:
 
     @property
     def step_px(self) -> float:
-        """Between neighbours."""
         return float(self.u[1] - self.u[0])
 
 
@@ -84,11 +82,23 @@ def mesh_grid(cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings
     Ref: Evans, Kirkpatrick & Townsend, "Right-triangulated irregular networks", Algorithmica 2001.
     """
     cloud = usable(cloud.select(cloud.xyz[:, 2] > 0))
-    grid = _smoothed(_sorted(cloud, camera))
+    grid = _sorted(cloud, camera)
+    # Smoothed twice: disparities that are far off the first time hardly count the second.
+    first = _fit_planes(grid, np.ones(grid.point.shape))
+    off = (grid.disparity - first.disparity) / first.sigma
+    grid = _fit_planes(grid, np.asarray(1 / (1 + off**2)))
     edges = _edges(grid)
-    pixels = _whole(_triangles(_errors(grid, edges)), grid, edges)
-    place, faces = _manifold(pixels, settings.min_component_faces, grid.point.shape[1])
-    row, column = np.divmod(place, grid.point.shape[1])
+    pixels, width = _triangles(_errors(grid, edges)), grid.point.shape[1]
+    # Those with points at their corners, and no edge or change between them.
+    pixels = pixels[np.ptp(grid.changes.ravel()[pixels], axis=1) <= 1]  # NaN without a point
+    right = np.pad(edges[0], ((0, 0), (0, 1))).ravel()
+    down = np.pad(edges[1], ((0, 1), (0, 0))).ravel()
+    kept = np.ones(len(pixels), np.bool_)
+    for end in pixels.T[:2]:
+        low, way = np.minimum(end, pixels[:, 2]), np.abs(end - pixels[:, 2])
+        kept &= ~((way == 1) & right[low]) & ~((way == width) & down[low])
+    place, faces = _manifold(pixels[kept], settings.min_component_faces, width)
+    row, column = np.divmod(place, width)
     z = camera.focal_px * camera.baseline_m / grid.disparity[row, column]
     x, y = (k * z / camera.focal_px for k in (grid.u[column], grid.v[row]))
     vertices = np.stack([x, y, z], axis=1).astype(np.float32)
@@ -103,8 +113,9 @@ def _sorted(cloud: PointCloud, camera: RectifiedCamera) -> _Grid:
     """Sort the points of a cloud into their pixels, of which it may have every n-th."""
     z = cloud.xyz[:, 2].astype(np.float64)
     u, v = (camera.focal_px * cloud.xyz[:, k] / z for k in (0, 1))
-    column, first_u = _places(u + camera.cx_px)
-    row, first_v = _places(v + camera.cy_px)
+    column, row = (np.rint(k).astype(np.int64) for k in (u + camera.cx_px, v + camera.cy_px))
+    first_u, first_v = int(column.min()), int(row.min())
+    column, row = column - first_u, row - first_v
     step = max(1, int(np.gcd(np.gcd.reduce(column), np.gcd.reduce(row))))
     column, row = column // step, row // step
     # The grid is padded to whole squares.
@@ -119,20 +130,6 @@ def _sorted(cloud: PointCloud, camera: RectifiedCamera) -> _Grid:
     across, below = (step * np.arange(count, dtype=np.float64) for count in (width, height))
     across, below = across + (first_u - camera.cx_px), below + (first_v - camera.cy_px)
     return _Grid(point, disparity, sigma, flat, flat, across, below)
-
-
-def _places(coordinates: Float64) -> tuple[Int64, int]:
-    """The pixels of coordinates, counted from the first one."""
-    pixels = np.rint(coordinates).astype(np.int64)
-    first = int(pixels.min())
-    return pixels - first, first
-
-
-def _smoothed(grid: _Grid) -> _Grid:
-    """Smooth disparities twice: those that are far off the first time hardly count the second."""
-    first = _fit_planes(grid, np.ones(grid.point.shape))
-    off = (grid.disparity - first.disparity) / first.sigma
-    return _fit_planes(grid, np.asarray(1 / (1 + off**2)))
 
 
 def _fit_planes(grid: _Grid, trust: Float64) -> _Grid:
@@ -182,7 +179,6 @@ def _fit_planes(grid: _Grid, trust: Float64) -> _Grid:
 
 
 def _nearest(point: Int32) -> Int32:
-    """The nearest point (R, C) of each pixel."""
     missing = (point < 0).astype(np.uint8)
     kind = cv2.DIST_LABEL_PIXEL
     label = cv2.distanceTransformWithLabels(missing, cv2.DIST_L2, 3, labelType=kind)[1]
@@ -192,7 +188,6 @@ def _nearest(point: Int32) -> Int32:
 
 
 def _window(values: Float64) -> Float64:
-    """The sum over the window around each pixel."""
     size = (2 * _RADIUS + 1, 2 * _RADIUS + 1)
     border = cv2.BORDER_CONSTANT
     summed = cv2.boxFilter(values, cv2.CV_64F, size, normalize=False, borderType=border)
@@ -225,7 +220,14 @@ def _errors(grid: _Grid, edges: tuple[Bool, Bool]) -> Float64:
     off in one of the parts counts for the whole. It is always split where the depth changes too
     much within.
     """
-    error = np.where(_torn(grid.valid, edges), np.inf, 0.0)
+    # Beside an edge of a surface triangles must be smallest; they have diagonal sides, too.
+    valid, torn = grid.valid, np.zeros(grid.valid.shape, np.uint8)
+    right, down = edges[0] & (valid[:, :-1] | valid[:, 1:]), edges[1] & (valid[:-1] | valid[1:])
+    torn[:, :-1] |= right
+    torn[:, 1:] |= right
+    torn[:-1] |= down
+    torn[1:] |= down
+    error = np.where(cv2.dilate(torn, np.ones((3, 3), np.uint8)) > 0, np.inf, 0.0)
     size = 2
     while size <= _SQUARE:
         for view in (np.asarray, np.transpose):
@@ -236,18 +238,6 @@ def _errors(grid: _Grid, edges: tuple[Bool, Bool]) -> Float64:
         error[size // 2 :: size, size // 2 :: size][_span(corners) > 1] = np.inf
         size *= 2
     return error
-
-
-def _torn(valid: Bool, edges: tuple[Bool, Bool]) -> Bool:
-    """Return bool (R, C): pixels beside an edge of a surface, whose triangles must be smallest."""
-    right, down = edges[0] & (valid[:, :-1] | valid[:, 1:]), edges[1] & (valid[:-1] | valid[1:])
-    torn = np.zeros(valid.shape, np.uint8)
-    torn[:, :-1] |= right
-    torn[:, 1:] |= right
-    torn[:-1] |= down
-    torn[1:] |= down
-    # Triangles have diagonal sides, too.
-    return np.asarray(cv2.dilate(torn, np.ones((3, 3), np.uint8)) > 0)
 
 
 def _add_sides(error: Float64, d: Float64, sigma: Float64, size: int) -> None:
@@ -298,10 +288,7 @@ def _corners(size: int) -> list[tuple[slice, slice]]:
 
 
 def _falling(shape: tuple[int, ...]) -> Bool:
-    """Which squares are cut from the upper left to the lower right; the others the other way.
-
-    Squares of half the size are cut towards the middle of those that they are parts of.
-    """
+    """Return which squares are cut from upper left to lower right; others the other way."""
     row, column = np.indices(shape)
     return np.asarray((row + column) % 2 == 0)
 
@@ -323,19 +310,6 @@ def _triangles(error: Float64) -> Int64:
         halves = ([corner, first, middle], [last, corner, middle])
         open_ = np.concatenate([np.stack(half) for half in halves], axis=1)
     return np.asarray(np.concatenate([*done, open_], axis=1).T, np.int64)
-
-
-def _whole(faces: Int64, grid: _Grid, edges: tuple[Bool, Bool]) -> Int64:
-    """The triangles (F, 3) with points at their corners, and no edge or change between them."""
-    faces = faces[np.ptp(grid.changes.ravel()[faces], axis=1) <= 1]  # NaN without a point
-    width = grid.point.shape[1]
-    right = np.pad(edges[0], ((0, 0), (0, 1))).ravel()
-    down = np.pad(edges[1], ((0, 1), (0, 0))).ravel()
-    kept = np.ones(len(faces), np.bool_)
-    for end in faces.T[:2]:
-        low, way = np.minimum(end, faces[:, 2]), np.abs(end - faces[:, 2])
-        kept &= ~((way == 1) & right[low]) & ~((way == width) & down[low])
-    return faces[kept]
 
 
 def _manifold(faces: Int64, least: int, width: int) -> tuple[Int64, Int32]:
@@ -365,3 +339,50 @@ def _manifold(faces: Int64, least: int, width: int) -> tuple[Int64, Int32]:
     pixel[corner] = faces
     used, numbered = renumbered(corner[kept])
     return pixel[used], numbered
+
+
+_LEAST_THICKNESS: Final = 1e-5  # of the depth; coordinates are exact to less than a hundredth of it
+_APART: Final = 0.05  # of the way to the middle of its triangles, that a corner moves off another
+
+
+def closed_behind(mesh: TriangleMesh, thickness_m: float) -> TriangleMesh:
+    """Close the surface that a camera sees, at a thickness behind it.
+
+    Each vertex is repeated on its ray, farther by the thickness in depth; walls along all edges of
+    the surface, those of holes too, join both. No two rays meet, so that no part of the body is in
+    another, nor are bodies of surfaces that lie one behind the other.
+
+    Args:
+        mesh: A manifold mesh in camera axes, of which a ray meets one triangle at most. Surfaces
+            that touch in a vertex have one each, which are moved apart by a part of a pixel.
+        thickness_m: Above 0; `MeshingError` if it is lost in the precision of the coordinates.
+
+    Returns:
+        A watertight mesh, with unit normals outwards; what is behind has the colours before it.
+    """
+    least_m = _LEAST_THICKNESS * float(mesh.vertices[:, 2].max())
+    if thickness_m < least_m:
+        what, expected = "the solid is too thin for its distance", f"at least {least_m:.3g} m"
+        hint = "raise mesh.pair_solid_m"
+        raise MeshingError(what, got=f"{thickness_m:g} m", expected=expected, hint=hint)
+    # No two vertices may be in one place: else programs join them again.
+    _, place, count = np.unique(mesh.vertices, axis=0, return_inverse=True, return_counts=True)
+    middles = mesh.vertices[mesh.faces].mean(axis=1, dtype=np.float64)
+    corner, face = mesh.faces.ravel(), np.repeat(np.arange(len(mesh.faces)), 3)
+    number = np.maximum(np.bincount(corner, minlength=len(mesh.vertices)), 1)
+    inside = [np.bincount(corner, axis[face], len(mesh.vertices)) / number for axis in middles.T]
+    moved = mesh.vertices + _APART * (np.stack(inside, axis=1) - mesh.vertices)
+    shared = count[place.ravel()] > 1
+    front = np.where(shared[:, None], moved, mesh.vertices).astype(np.float32)
+    back = front * (1 + thickness_m / front[:, 2:].astype(np.float64))
+    vertices = np.concatenate([front, back]).astype(np.float32)
+    # The edges that one triangle alone has, in its direction.
+    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    ends = np.sort(edges, axis=1)
+    _, first, count = np.unique(ends, axis=0, return_index=True, return_counts=True)
+    behind, edges = mesh.faces + len(front), edges[first[count == 1]]
+    (a, b), (c, d) = edges.T, edges.T + len(front)
+    walls = np.concatenate([np.stack([b, a, c], axis=1), np.stack([b, c, d], axis=1)])
+    faces = np.concatenate([mesh.faces, behind[:, ::-1], walls]).astype(np.int32)
+    rgb = None if mesh.rgb is None else np.concatenate([mesh.rgb, mesh.rgb])
+    return TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from recon.core.errors import MeshingError
+from recon.core.geometry.se3 import apply, rotate
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.machine import available_cores
 from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values import TriangleMesh
-from recon.core.values.arrays import Bool, Float32, Int32, Int64
+from recon.core.values.arrays import Float32, Int32, Int64
 from recon.core.work import side_by_side
 from recon.export.cloud import export_cloud
 from recon.export.mesh.cut import (
@@ -26,14 +28,18 @@ from recon.export.mesh.cut import (
     components,
     cut_mesh,
     nearest_on_edges,
-    open_edges,
-    open_faces,
+    open_corners,
     with_faces,
 )
-from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
-from recon.export.mesh.surveyed import write_surveyed
-from recon.export.mesh.voxels import reconstruct_map_surface
+from recon.export.mesh.poisson import (
+    OVERLAP_M,
+    MeshSettings,
+    reconstruct_map_surface,
+    reconstruct_mesh,
+)
 from recon.export.product import ExportContext, ExportResult
+from recon.io.atomic import write_text
+from recon.io.models.las import check_crs
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.map.cut import Rectangle
@@ -94,11 +100,7 @@ def mesh_product(context: ExportContext, path: Path) -> ExportResult:
 
 
 def export_mesh(
-    tiles: Tiles,
-    settings: MeshSettings,
-    path: Path,
-    cloud: Path,
-    threads: int | None = None,
+    tiles: Tiles, settings: MeshSettings, path: Path, cloud: Path, threads: int | None = None
 ) -> ExportResult:
     """Write the surface of a map, its pieces if there are several, and a MeshLab project.
 
@@ -172,18 +174,23 @@ class _Mesher:
             if len(mesh.faces):
                 paths.append(self.folder / f"tile_{key[0]}_{key[1]}.ply")
                 write_mesh(paths[-1], mesh)
-        ends = np.cumsum([*map(len, self.sizes)], dtype=np.int64)
-        kept = np.split(self._large_enough(), ends)[: len(paths)]
-        pieces = [_without_crumbs(*each) for each in zip(paths, kept, strict=True)]
-        return [piece for piece in pieces if piece.faces], self._warnings(failed)
-
-    def _large_enough(self) -> Bool:
-        """Return bool (C,), components of enough faces, with those that they meet in seams."""
+        # Components of enough faces, with those that they meet in seams.
         sizes = np.concatenate([np.zeros(0, np.int32), *self.sizes])
         met = np.concatenate([np.zeros((0, 2), np.int64), *self.seams])
         whole = components(met, len(sizes))
         least = self.settings.min_component_faces if self.settings.target_faces is None else 1
-        return np.asarray((np.bincount(whole, sizes) >= least)[whole])
+        large = (np.bincount(whole, sizes) >= least)[whole]
+        ends = np.cumsum([*map(len, self.sizes)], dtype=np.int64)
+        kept = np.split(large, ends)[: len(paths)]
+        pieces = []
+        for path, own in zip(paths, kept, strict=True):
+            mesh = read_mesh(path)
+            if not own.all():  # it is written again, if anything is left
+                mesh = with_faces(mesh, mesh.faces[own[component_labels(mesh.faces)[0]]])
+                write_mesh(path, mesh) if len(mesh.faces) else path.unlink()
+            if len(mesh.faces):
+                pieces.append(MeshPiece(path, len(mesh.vertices), len(mesh.faces)))
+        return pieces, self._warnings(failed)
 
     def _warnings(self, failed: dict[PieceKey, MeshingError]) -> list[str]:
         """Return a line about the pieces without a surface, naming the one with the most points."""
@@ -238,8 +245,9 @@ class _Mesher:
         first = sum(map(len, self.sizes))
         self.sizes.append(sizes)
         for plane, border in borders.items():
-            components = labels[open_faces(mesh, plane)].astype(np.int64) + first
-            own = Border(open_edges(mesh, plane), components)
+            corners = open_corners(mesh, plane)
+            components = labels[corners[:, 3]].astype(np.int64) + first
+            own = Border(mesh.vertices[corners[:, :2]], components)
             if border is None:
                 self.borders[key, plane] = own
             elif len(own.edges) and len(border.edges):
@@ -260,14 +268,35 @@ class _Mesher:
         return Plane(axis, (sides.high if far else sides.low)[axis])
 
 
-def _without_crumbs(path: Path, kept: Bool) -> MeshPiece:
-    """Write a piece again without some of its components, if not all are kept; none: no file."""
-    mesh = read_mesh(path)
-    labels, _ = component_labels(mesh.faces)
-    if not kept.all():
-        mesh = with_faces(mesh, mesh.faces[kept[labels]])
-        if len(mesh.faces):
-            write_mesh(path, mesh)
-        else:
-            path.unlink()
-    return MeshPiece(path, len(mesh.vertices), len(mesh.faces))
+_ROUND_M: Final = 100.0
+
+
+def write_surveyed(
+    context: ExportContext, mesh: TriangleMesh, folder: Path, formats: Sequence[str]
+) -> dict[str, Any]:
+    """Write a mesh, map axes, once more into a folder; return its figures.
+
+    Its axes are east, north and up. ``offset.xyz`` has what is to be added to its coordinates:
+    hundreds of metres to the east and north; ``mesh.prj`` the coordinate system, if it is known.
+    Without a survey nothing is written.
+    """
+    if context.survey is None:
+        return {}
+    T_survey_map = context.T_survey_map
+    offset_m = np.array([*(np.floor(T_survey_map[:2, 3] / _ROUND_M) * _ROUND_M), 0.0])
+    T_mesh_map = T_survey_map.copy()
+    T_mesh_map[:3, 3] -= offset_m
+    normals = None if mesh.normals is None else rotate(T_mesh_map, mesh.normals.astype(np.float64))
+    moved = replace(
+        mesh,
+        vertices=apply(T_mesh_map, mesh.vertices.astype(np.float64)).astype(np.float32),
+        normals=None if normals is None else normals.astype(np.float32),
+    )
+    for suffix in dict.fromkeys(formats):
+        write_mesh(folder / f"mesh.{suffix}", moved, "map")
+    text = " ".join(f"{metres:.0f}" for metres in offset_m)
+    write_text(folder / "offset.xyz", f"{text}\n")
+    if context.crs is not None:
+        wkt = check_crs(context.crs).to_wkt("WKT1_ESRI")
+        write_text(folder / "mesh.prj", f"{wkt}\n")
+    return {"mesh_offset_m": offset_m.tolist()}

@@ -1,4 +1,7 @@
-"""Screened Poisson reconstruction of a cloud, trimmed to where there is data."""
+"""The surface of a cloud: by screened Poisson reconstruction, or through the voxels of a map.
+
+Both are trimmed to where there is data; decision 0036.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,7 @@ from recon.core.values.arrays import Bool, Float32, Int32
 from recon.export.mesh.cut import drop_small_components, keep_vertices, vertex_normals
 from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes
+from recon.map.kernels.distance import surface_of
 from recon.stereo import open3d_clouds
 
 OVERLAP_M: Final = 3.0
@@ -100,29 +104,38 @@ def reconstruct_mesh(
     Args:
         cloud: Points, with normals if possible; vertices take their colours.
         settings: Settings of the reconstruction.
-        viewpoint_m: The position that the points were seen from, in the frame of the cloud; used
-            only if the cloud has no normals. None = normals are only made consistent, and may
-            all be flipped.
+        viewpoint_m: Where the points were seen from, if they have no normals; None = they are only
+            made consistent, and may all be flipped.
         wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
 
     Returns:
         The mesh, with outward unit normals, and colours if the cloud has any.
 
     Raises:
-        MeshingError: The points are too few, coincident or collinear; Poisson failed; or
-            trimming left no face.
+        MeshingError: The points are too few, coincident or collinear, or no face is left.
 
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
     cloud = oriented(cloud, viewpoint_m)
-    depth = settings.depth or _fitting_depth(cloud.xyz, settings)
+    depth = settings.depth
+    if depth is None:  # the smallest whose cells are no wider than the settings allow
+        cell_m = settings.cell_spacings * typical_spacing_m(cloud.xyz)
+        extent_m = float(np.ptp(cloud.xyz, axis=0).max()) * _OCTREE_SCALE
+        depth = settings.max_depth
+        if cell_m * 2**depth > extent_m:
+            depth = int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, depth))
     normals = np.asarray(cloud.normals)
     vertices, faces, density = screened_poisson(
         cloud.xyz, normals, depth, _OCTREE_SCALE, settings.point_weight
     )
     supported = density >= np.quantile(density, settings.trim_density_quantile)
     if settings.max_distance_spacings is not None:
-        supported &= _near_data(vertices, cloud.xyz, settings.max_distance_spacings)
+        index, distance_m = open3d_clouds.nearest(vertices, cloud.xyz)
+        near, where = np.unique(index[:, 0], return_inverse=True)
+        local_m = _spacing(cloud.xyz[near], cloud.xyz)
+        # A lone point is far from its neighbours, and must not support a large patch of surface.
+        local_m = np.minimum(local_m, 2 * np.median(local_m))
+        supported &= distance_m[:, 0] <= settings.max_distance_spacings * local_m[where]
     return trimmed(keep_vertices(vertices, faces, supported), cloud, settings, wrong)
 
 
@@ -132,10 +145,7 @@ def trimmed(
     settings: MeshSettings,
     wrong: Callable[[Float32], Bool] | None,
 ) -> TriangleMesh:
-    """Return vertices (V, 3) and faces (F, 3) without those that cannot be, and without crumbs.
-
-    Vertices take the colours of the nearest points of the cloud.
-    """
+    """Return the part of a surface that can be, without crumbs, in the colours of a cloud."""
     vertices, faces = surface
     if wrong is not None:
         vertices, faces = keep_vertices(vertices, faces, ~wrong(vertices))
@@ -155,7 +165,6 @@ def simplified(mesh: TriangleMesh, settings: MeshSettings) -> TriangleMesh:
 
 
 def _nearest(some_xyz: Float32, xyz: Float32) -> Int32:
-    """Return int32 (N,): the nearest point of a cloud to each of some places."""
     return open3d_clouds.nearest(some_xyz, xyz)[0][:, 0]
 
 
@@ -166,7 +175,13 @@ def usable(cloud: PointCloud) -> PointCloud:
         expected = f"at least {_MIN_POINTS} finite points"
         raise MeshingError("too few points for a surface", got=int(finite.sum()), expected=expected)
     cloud = cloud.select(finite)
-    _refuse_outliers(cloud.xyz)
+    # An octree would have the points of a cloud in one cell whose box is much wider.
+    away_m = np.linalg.norm(cloud.xyz.astype(np.float64) - np.median(cloud.xyz, axis=0), axis=1)
+    half_m, farthest_m = float(np.median(away_m)), float(away_m.max())
+    if farthest_m > _FARTHEST * half_m > 0:
+        half = f"of which half of the points are within {half_m:.3g} m"
+        got, hint = f"{farthest_m:.3g} m from the middle, {half}", "remove outliers from the cloud"
+        raise MeshingError("a point lies far from all others", got=got, hint=hint)
     centred = cloud.xyz.astype(np.float64) - cloud.xyz.mean(axis=0, dtype=np.float64)
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(centred)), 0))
     # float32 coordinates resolve about 1e-5 of the extent.
@@ -174,19 +189,9 @@ def usable(cloud: PointCloud) -> PointCloud:
     if spread[1] <= 1e-5 * max(spread[2], farthest):
         distant = spread[1] > 1e-5 * spread[2] and spread[1] > 0
         got = f"{counted(len(cloud), 'point')}, up to {farthest:.3g} m from the origin"
-        hint = "subtract an offset from all coordinates" if distant else None
-        raise MeshingError("all points lie in one place or on one line", got=got, hint=hint)
+        way_on = "subtract an offset from all coordinates" if distant else None
+        raise MeshingError("all points lie in one place or on one line", got=got, hint=way_on)
     return cloud
-
-
-def _refuse_outliers(xyz: Float32) -> None:
-    """Refuse a cloud whose box is so wide that an octree would have its points in one cell."""
-    away_m = np.linalg.norm(xyz.astype(np.float64) - np.median(xyz, axis=0), axis=1)
-    half_m, farthest_m = float(np.median(away_m)), float(away_m.max())
-    if farthest_m > _FARTHEST * half_m > 0:
-        half = f"of which half of the points are within {half_m:.3g} m"
-        got, hint = f"{farthest_m:.3g} m from the middle, {half}", "remove outliers from the cloud"
-        raise MeshingError("a point lies far from all others", got=got, hint=hint)
 
 
 def oriented(cloud: PointCloud, viewpoint_m: Point | None = None) -> PointCloud:
@@ -206,15 +211,6 @@ def oriented(cloud: PointCloud, viewpoint_m: Point | None = None) -> PointCloud:
     return replace(cloud, normals=normals)
 
 
-def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
-    """Return the smallest octree depth whose cells are no wider than the settings allow."""
-    cell_m = settings.cell_spacings * typical_spacing_m(xyz)
-    extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
-    if cell_m * 2**settings.max_depth <= extent_m:
-        return settings.max_depth
-    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, settings.max_depth))
-
-
 def typical_spacing_m(xyz: Float32) -> float:
     """Return the median distance of the points of a cloud to their seventh neighbour."""
     step = max(1, len(xyz) // _SPACING_SAMPLES)
@@ -226,11 +222,28 @@ def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:
     return open3d_clouds.nearest(some_xyz, xyz, _SPACING_NEIGHBOURS)[1][:, -1]
 
 
-def _near_data(vertices: Float32, xyz: Float32, spacings: float) -> Bool:
-    """Return bool (V,): vertices within ``spacings`` local point spacings of the nearest point."""
-    index, distance_m = open3d_clouds.nearest(vertices, xyz)
-    near, where = np.unique(index[:, 0], return_inverse=True)
-    local_m = _spacing(xyz[near], xyz)
-    # A lone point is far from its neighbours, and must not support a large patch of surface.
-    local_m = np.minimum(local_m, 2 * np.median(local_m))
-    return np.asarray(distance_m[:, 0] <= spacings * local_m[where])
+_OF_SEVENTH: Final = math.sqrt(math.pi / 7)
+"""Edge of the square that a point has for itself, as a fraction of the way to its seventh neighbour:
+a circle that wide holds seven."""
+
+
+def reconstruct_map_surface(
+    cloud: PointCloud,
+    settings: MeshSettings,
+    voxel_m: float,
+    wrong: Callable[[Float32], Bool] | None = None,
+) -> TriangleMesh:
+    """Return the surface that the points of a map with voxels of ``voxel_m`` lie on.
+
+    Cells are as wide as its voxels, or two, four … times where points are that far apart. They
+    have the same places in all parts of a map, so that these meet. Otherwise as `reconstruct_mesh`.
+    """
+    cloud = oriented(cloud)
+    apart = _OF_SEVENTH * typical_spacing_m(cloud.xyz) / voxel_m
+    cell_m = voxel_m * 2 ** round(math.log2(max(apart, 1)))
+    # In float32 the kernel would lose what a large coordinate leaves no digits for.
+    origin = np.floor(cloud.xyz.min(axis=0) / cell_m).astype(np.float64)
+    farthest = settings.max_distance_spacings or math.inf
+    places, faces = surface_of(cloud.xyz / cell_m - origin, np.asarray(cloud.normals), farthest)
+    vertices = ((places + origin) * cell_m).astype(np.float32)
+    return trimmed((vertices, faces), cloud, settings, wrong)

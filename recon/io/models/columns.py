@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError
 from recon.core.values import ATTRIBUTES, Attribute, PointCloud, TriangleMesh
 from recon.core.values.arrays import Float32
-from recon.core.values.attributes import Format
+from recon.core.values.cloud import Format
 from recon.io.models.ply_tables import Table
 
 Columns = dict[str, NDArray[Any]]

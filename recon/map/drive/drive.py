@@ -66,9 +66,16 @@ class Drive:
         self._saved = 0
         self._start = self._last = self._saved_s = time.perf_counter()
         with resuming(self._map.store.name):
-            state = self.session.state()
-            if state is not None:
-                self._restore(state)
+            if (state := self.session.state()) is None:
+                return
+            self.mapper.restore(state["mapper"])
+            if state.get("last_view") is not None:  # none of a drive put together of pieces
+                self._views.last = LastView(**state["last_view"])
+            if len(self.session):
+                path, health = self.session.odometry, self.session.health
+                self._loops.restore(path.T_world_camera, segment_numbers(health))
+            self._saved, self._last = len(self.mapper), time.perf_counter()
+            self._start = self._last - state["seconds"]
 
     def begin_at(self, frame: int) -> None:
         """Lay the axes of the map by the ground of a frame, and save what the odometry found."""
@@ -77,17 +84,10 @@ class Drive:
         self._save()
 
     def frames(self, tracks: LiveTracks | None = None) -> Generator[FrameResult]:
-        """Yield the pose of each frame that is left, which becomes part of the map.
-
-        Of a drive that arrives, ``tracks`` keep what shows its rig.
-        """
+        """Yield the pose of each frame left; ``tracks`` keep what a live drive shows of its rig."""
         if self.source.live:
             return poses_first(
-                self.source,
-                self.reconstructor,
-                self.mapper.register,
-                self._map_behind,
-                tracks,
+                self.source, self.reconstructor, self.mapper.register, self._map_behind, tracks
             )
         return self._in_order()
 
@@ -125,7 +125,10 @@ class Drive:
         self._loops.add(frame, result.T_world_camera, result.segment)
         if result.index <= self._total // 2 and (self.sample is None or len(frame.cloud)):
             self.sample = frame
-        if self._due():
+        due = len(self.mapper) - self._saved >= self.config.checkpoints.every_frames
+        if self.source.live:
+            due = time.perf_counter() - self._saved_s >= _COMMIT_S
+        if due:
             self._save()
         self.config.memory.check(f"frame {result.index}")
         now = time.perf_counter()
@@ -144,7 +147,6 @@ class Drive:
         self._loops.stop()
 
     def finish(self) -> None:
-        """Save what is left of the drive."""
         if not len(self.mapper):
             raise RegistrationError("the source has no frame")
         if len(self.mapper) > self._saved:
@@ -169,22 +171,6 @@ class Drive:
     def seconds(self) -> float:
         """Time from the first frame to the last."""
         return self._last - self._start
-
-    def _due(self) -> bool:
-        if self.source.live:
-            return time.perf_counter() - self._saved_s >= _COMMIT_S
-        return len(self.mapper) - self._saved >= self.config.checkpoints.every_frames
-
-    def _restore(self, state: dict[str, Any]) -> None:
-        self.mapper.restore(state["mapper"])
-        if state.get("last_view") is not None:  # none of a drive that was put together of pieces
-            self._views.last = LastView(**state["last_view"])
-        if len(self.session):
-            path, health = self.session.odometry, self.session.health
-            self._loops.restore(path.T_world_camera, segment_numbers(health))
-        self._saved = len(self.mapper)
-        self._last = time.perf_counter()
-        self._start = self._last - state["seconds"]
 
     def _save(self) -> None:
         if self._map.store.path is None:
@@ -219,7 +205,7 @@ def poses_first(
     map_frame: MapFrame,
     tracks: LiveTracks | None = None,
 ) -> Generator[FrameResult]:
-    """Yield the pose of each frame as soon as it is known, by odometry on rough disparities.
+    """Yield each pose as soon as it is known, by odometry on rough disparities.
 
     ``map_frame`` is called in another thread, in order; ``tracks`` keep what shows the rig.
     """
@@ -349,13 +335,7 @@ def resuming(where: str | Path) -> Iterator[None]:
 def session_info(
     source: StereoSource, config: DriveSettings, start: Mapping[str, Any] | None = None
 ) -> SessionInfo:
-    """Return what a session is a drive of.
-
-    Args:
-        source: The source.
-        config: The settings.
-        start: What a run is started with, to resume it.
-    """
+    """Return what a session is a drive of; ``start`` is what a run is begun with, to resume it."""
     return SessionInfo(
         source.name,
         source.description,

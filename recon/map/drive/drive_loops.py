@@ -131,7 +131,6 @@ class LoopWatch:
         self._waiting.append(self._pool.submit(look))
 
     def wait(self) -> None:
-        """Wait until all frames so far have been processed."""
         self._wait(0)
 
     def stop(self) -> None:
@@ -163,7 +162,6 @@ class LoopWatch:
         )
 
     def _wait(self, left: int) -> None:
-        """Wait until at most ``left`` frames are pending."""
         while len(self._waiting) > left:
             self._waiting.popleft().result()
 

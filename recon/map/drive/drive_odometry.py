@@ -42,7 +42,6 @@ class UsedPrior:
     sigmas: Mapping[str, float] = field(default_factory=dict)
 
     def warnings(self) -> list[str]:
-        """Return what the user should know about it."""
         if self.known_from != "assumed":
             return []
         what = "too little motion was seen to tell the axes of the prior"
@@ -112,10 +111,7 @@ def imu_of(
 def doubt_poses(
     known_poses: Trajectory, source: StereoSource, config: DriveSettings
 ) -> tuple[str, ...]:
-    """Return a line for the user if known poses contradict what the cameras see.
-
-    They are compared with the first motions, in camera axes and in those of a body.
-    """
+    """Return a line if known poses contradict the first motions that the cameras see."""
     poses = _of_frames(known_poses, source).T_world_camera
     by_number = Trajectory(poses, np.arange(len(poses), dtype=np.float64))
     if len(poses) < 2:
@@ -137,7 +133,6 @@ def doubt_poses(
 
 
 def _of_frames(known_poses: Trajectory, source: StereoSource) -> Trajectory:
-    """Return the known pose of each frame."""
     lines = source.lines(len(known_poses))
     if lines is None:
         raise RegistrationError(

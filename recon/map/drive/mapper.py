@@ -20,6 +20,8 @@ from recon.map.builders import (
     CloudBuilder,
     OccupancyBuilder,
     OccupancySettings,
+    Submap,
+    SubmapSettings,
     ray_grain,
     thin_rays,
 )
@@ -27,7 +29,6 @@ from recon.map.fusion import FusionSettings, fusion_range_m
 from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
-from recon.map.submaps import Submap, SubmapSettings
 from recon.odometry.checked import SegmentCounter
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult
 from recon.stereo.frame import ReconstructedFrame
@@ -62,7 +63,6 @@ class Mapper:
         return len(self.session)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        """Find the pose of the next frame."""
         with self._stage("odometry"):
             return self._odometry.register(frame)
 
@@ -175,10 +175,7 @@ _MAX_FRAMES: Final = 100
 
 
 class SubmapBuilder:
-    """Builds the submaps of a drive, one after the other.
-
-    At ``max_bytes`` a new submap begins; None = no limit.
-    """
+    """Builds the submaps of a drive, none of more than ``max_bytes`` (None = no limit)."""
 
     def __init__(
         self,

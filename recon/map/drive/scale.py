@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
@@ -33,7 +33,16 @@ class SceneScale:
 
 def measure_scene(pairs: Iterable[Recorded], rig: Rig, settings: StereoSettings) -> SceneScale:
     """Measure how large what a drive shows is, on a few of its pairs."""
-    depths = list(_depths(pairs, rig, settings))
+    reconstructor, depths = FrameReconstructor(rig, settings), []
+    camera = reconstructor.camera
+    for pair in pairs:
+        with suppress(ReconError):  # that it cannot be matched is said when it is mapped
+            _, disparity = reconstructor.match(pair)
+            found = disparity.values[disparity.measured] + camera.doffs_px
+            if len(found) and found.mean() > 0.0:
+                depth_m = camera.focal_px * camera.baseline_m / float(found.mean())
+                sigma_px = float(np.median(disparity.sigma_px[disparity.measured]))
+                depths.append((depth_m, depth_m * sigma_px / float(found.mean())))
     if not depths:
         return SceneScale()
     depth_m, sigma_m = np.median(depths, axis=0).tolist()
@@ -54,22 +63,3 @@ def scale_of(depth_m: float, sigma_m: float) -> float:
     least = sigma_m / (_MOST_VOXELS * FusionSettings().voxel_m)
     placed = next((scale for scale in _SERIES if scale >= least), _SERIES[-1])
     return float(np.clip(max(nearest, placed), *SCALES))
-
-
-def _depths(
-    pairs: Iterable[Recorded], rig: Rig, settings: StereoSettings
-) -> Iterator[tuple[float, float]]:
-    """Yield depth of the mean disparity of some frames, and its standard deviation, metres.
-
-    A frame that cannot be matched is left out: that is said when it is mapped.
-    """
-    reconstructor = FrameReconstructor(rig, settings)
-    camera = reconstructor.camera
-    for pair in pairs:
-        with suppress(ReconError):
-            _, disparity = reconstructor.match(pair)
-            found = disparity.values[disparity.measured] + camera.doffs_px
-            if len(found) and found.mean() > 0.0:
-                depth_m = camera.focal_px * camera.baseline_m / float(found.mean())
-                sigma_px = float(np.median(disparity.sigma_px[disparity.measured]))
-                yield depth_m, depth_m * sigma_px / float(found.mean())

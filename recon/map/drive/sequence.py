@@ -71,10 +71,8 @@ class MappedSequence:
         map: The map, in which the drive is the only session.
         sample: The frame in the middle of the drive, for display.
         seconds: Wall-clock time from the first frame to the last.
-        loops: Result of loop closure; None = it was not run.
-        prior: How the external trajectory was used; None = there was none.
-        imu: What the drive shows of its inertial unit; None = it has none, or is not used.
-        sfm: What structure from motion found; None = it was not asked.
+        loops, prior, imu, sfm: What came of loop closure, of an external trajectory, of an inertial
+            unit, of structure from motion; None = they were not used.
         threads: Threads with which rays are cast.
         tracks: What a drive showed of its rig while it arrived; empty of any other.
     """
@@ -101,7 +99,6 @@ class MappedSequence:
 
     @cached_property
     def camera(self) -> RectifiedCamera:
-        """The rectified camera."""
         return self.session.camera
 
     @cached_property
@@ -116,7 +113,6 @@ class MappedSequence:
 
     @property
     def health(self) -> tuple[OdometryHealth, ...]:
-        """Health of each pose."""
         return self.session.health
 
     @property
@@ -299,11 +295,15 @@ _PRIOR: Final = (
 def check_cloud(frame: ReconstructedFrame, settings: CloudSettings, where: str) -> None:
     """Refuse a pair whose matches give no point."""
     if not len(frame.cloud):
+        farthest = "any depth" if settings.max_range_m is None else f"{settings.max_range_m:g} m"
+        limits = f"from {settings.min_range_m:g} m to {farthest}"
+        if settings.max_relative_sigma is not None:
+            limits += f", known to {100 * settings.max_relative_sigma:g} % of it"
         raise MappingError(
             "the cloud is empty",
             where=where,
             got=_depths(frame.disparity, frame.pair.camera),
-            expected=f"points {_limits(settings)}",
+            expected=f"points {limits}",
             hint="check the unit of the baseline, or set cloud.max_range_m and "
             "cloud.max_relative_sigma",
         )
@@ -348,19 +348,9 @@ def _explain_sample(mapped: MappedSequence) -> tuple[str, str]:
 
 
 def _depths(disparity: Disparity, camera: RectifiedCamera) -> str:
-    """Return the fraction of pixels with a match, and their depths."""
     ratio = f"{100 * float(disparity.measured.mean()):.1f} % of the pixels matched"
     if not disparity.measured.any():
         return ratio
     depth_m = depth_from_disparity(disparity.values[disparity.measured], camera)
     low, high = np.nanpercentile(depth_m, [5, 95])
     return f"{ratio}, at {low:.3g} to {high:.3g} m"
-
-
-def _limits(settings: CloudSettings) -> str:
-    """Return the depths and errors that a cloud takes, in words."""
-    farthest = "any depth" if settings.max_range_m is None else f"{settings.max_range_m:g} m"
-    limits = f"from {settings.min_range_m:g} m to {farthest}"
-    if settings.max_relative_sigma is None:
-        return limits
-    return f"{limits}, known to {100 * settings.max_relative_sigma:g} % of it"

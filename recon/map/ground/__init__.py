@@ -1,7 +1,7 @@
 """The ground below the path, and the flat grid above it.
 
 - `axes.py`: map axes, from the ground plane in the first frame;
-- `surface.py`: the ground along the drive, and farther away; `driven.py`: under the wheels;
-- `grid.py`: voxels flattened to the grid that robots plan on; `traverse.py`: what a robot can drive
-  over.
+- `surface.py`: the ground along the drive, and farther away;
+- `grid.py`: voxels flattened to the grid that robots plan on, free where the vehicle drove;
+- `traverse.py`: what a robot can drive over.
 """

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform, transform_cloud
@@ -26,7 +25,8 @@ the measured ground, and of a road's own slope."""
 _MAX_RANGE_M: Final = 20.0
 """How far away the ground is looked for: farther points are too uncertain to level by."""
 _INLIER_M: Final = 0.05  # distance to the plane of points that support it
-_MIN_INLIERS: Final = 500  # points that must support the plane, after thinning to 20 000
+_MOST_POINTS: Final = 20_000
+_MIN_INLIERS: Final = 500  # points that must support the plane, after thinning
 _TRIALS: Final = 300  # random planes that are tried
 
 
@@ -77,8 +77,14 @@ def map_axes(
     if up is not None:
         turn = _short_turn(AXES_MAP_WORLD @ up, np.array([0.0, 0.0, 1.0])) @ AXES_MAP_WORLD
     height_m = 0.0
-    if settings.origin == "ground":
-        height_m = _height_along_z(ground, turn) if camera_height_m is None else camera_height_m
+    if settings.origin == "ground" and camera_height_m is not None:
+        height_m = camera_height_m
+    elif settings.origin == "ground":
+        if ground is None:
+            what = "the first frame shows no ground to put the map's origin on"
+            hint = "start where it is seen, set ground.camera_height_m, or use axes.origin=camera"
+            raise MappingError(what, hint=hint)
+        height_m = ground.height_m / float(turn[2] @ ground.normal)
     return make_transform(turn, np.array([0.0, 0.0, height_m]))
 
 
@@ -101,15 +107,6 @@ def base_axes(T_map_world: Float64, camera_height_m: float | None) -> Float64:
     return make_transform(T_map_world[:3, :3], np.array([0.0, 0.0, camera_height_m or 0.0]))
 
 
-def _height_along_z(ground: GroundPlane | None, turn: NDArray[Any]) -> float:
-    if ground is None:
-        raise MappingError(
-            "the first frame shows no ground to put the map's origin on",
-            hint="start where it is seen, set ground.camera_height_m, or use axes.origin=camera",
-        )
-    return ground.height_m / float(turn[2] @ ground.normal)
-
-
 def estimate_ground(
     cloud: PointCloud, scale: float = 1.0, up: Float64 | None = None
 ) -> GroundPlane | None:
@@ -124,7 +121,11 @@ def estimate_ground(
         turn = make_transform(_short_turn(up, _UP_CAMERA), np.zeros(3))
         plane = estimate_ground(transform_cloud(cloud, turn, frame="camera"), scale)
         return None if plane is None else replace(plane, normal=plane.normal @ turn[:3, :3])
-    xyz, inlier_m = _candidates(cloud, scale * _MAX_RANGE_M), scale * _INLIER_M
+    xyz, inlier_m = cloud.xyz.astype(np.float64), scale * _INLIER_M
+    # Points in range that a tilted ground could hold, thinned evenly.
+    z, highest = xyz[:, 2], xyz[:, 2] * math.tan(math.radians(_MAX_TILT_DEG))
+    xyz = xyz[(z > 0) & (z < scale * _MAX_RANGE_M) & (xyz[:, 1] > -highest)]
+    xyz = xyz[:: max(1, math.ceil(len(xyz) / _MOST_POINTS))]
     if len(xyz) < _MIN_INLIERS:
         return None
     normal, height = _best_plane(xyz, inlier_m)
@@ -132,19 +133,13 @@ def estimate_ground(
         inside = np.abs(xyz @ normal + height) < inlier_m
         if inside.sum() < _MIN_INLIERS:
             return None
-        normal, height = _fit_plane(xyz[inside])
-    plane = GroundPlane(normal, float(height), int(inside.sum()))
+        # The plane nearest to the points in the least-squares sense; its normal points up.
+        centre = xyz[inside].mean(axis=0)
+        _, vectors = np.linalg.eigh(np.cov((xyz[inside] - centre).T))
+        normal = vectors[:, 0] * (-1.0 if vectors[1, 0] > 0 else 1.0)
+        height = float(-normal @ centre)
+    plane = GroundPlane(normal, height, int(inside.sum()))
     return plane if plane.tilt_deg <= _MAX_TILT_DEG and height > 0 else None
-
-
-def _candidates(cloud: PointCloud, range_m: float) -> Float64:
-    """Return points in range that a tilted ground could hold, thinned evenly; float64 (N, 3)."""
-    xyz = cloud.xyz.astype(np.float64)
-    z = xyz[:, 2]
-    highest = z * math.tan(math.radians(_MAX_TILT_DEG))
-    below = (z > 0) & (z < range_m) & (xyz[:, 1] > -highest)
-    xyz = xyz[below]
-    return np.asarray(xyz[:: max(1, math.ceil(len(xyz) / 20_000))])
 
 
 def _best_plane(xyz: Float64, inlier_m: float) -> tuple[Float64, float]:
@@ -162,11 +157,3 @@ def _best_plane(xyz: Float64, inlier_m: float) -> tuple[Float64, float]:
     votes = np.where(level & (heights > 0), support.sum(axis=0), -1)
     best = int(np.argmax(votes))
     return normals[best], float(heights[best])
-
-
-def _fit_plane(xyz: Float64) -> tuple[Float64, float]:
-    """Return the plane nearest to the points in the least-squares sense; its normal points up."""
-    centre = xyz.mean(axis=0)
-    _, vectors = np.linalg.eigh(np.cov((xyz - centre).T))
-    normal: NDArray[Any] = vectors[:, 0] * (-1.0 if vectors[1, 0] > 0 else 1.0)
-    return normal, float(-normal @ centre)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,7 +21,7 @@ from recon.core.errors import MappingError
 from recon.core.kernels.voxels import find_keys, pack_keys
 from recon.core.settings import Length, Settings
 from recon.core.values import OccupancyVoxels, PointCloud
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, freeze
+from recon.core.values.arrays import Bool, Float32, Float64, Int64, freeze
 from recon.core.values.grid import log_odds
 
 _BIN_M: Final = 0.05
@@ -35,6 +35,7 @@ the next."""
 MAX_TILT_DEG: Final = 35.0  # points with normals tilted more are no ground
 MIN_POINTS: Final = 3  # points that make a measured cell
 _MAX_GAP_M: Final = 4.0  # how far a height is carried over cells without points
+_BEYOND: Final = np.iinfo(np.int32).max  # ring of the cells that are out of reach
 
 
 class GroundSettings(Settings):
@@ -46,6 +47,21 @@ class GroundSettings(Settings):
     camera_height_m: float | None = Field(None, ge=0.01, le=100.0)
     """Height of the camera above ground; none = measured. Set it where the ground near the path is
     not seen."""
+
+
+class Raster(NamedTuple):
+    """Square cells seen from above; row 0 has the smallest y."""
+
+    origin_m: tuple[float, float]  # x and y of the outer corner of cell (0, 0)
+    cell_m: float
+    shape: tuple[int, int]  # rows, columns
+
+    def cells_of(self, xy_m: Float64) -> tuple[Int64, Bool]:
+        """Return the flat index of the cell of each place (N, 2), and whether there is one."""
+        column, row = np.floor((xy_m - self.origin_m) / self.cell_m).astype(np.int64).T
+        rows, columns = self.shape
+        inside = (row >= 0) & (column >= 0) & (row < rows) & (column < columns)
+        return row * columns + column, np.asarray(inside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +84,7 @@ class GroundSurface:
         freeze(self, "drops_m", np.float64, self.heights_m.shape)
 
     def height_at(self, xy: NDArray[Any]) -> Float64:
-        """Return the height of the ground at places (N, 2), bilinear between centres of cells.
-
-        NaN where the height of the cell of the place itself is unknown.
-        """
+        """Return heights at places (N, 2), bilinear; NaN where that of their cell is unknown."""
         place = (np.asarray(xy, dtype=np.float64) - self.origin_m) / self.cell_m
         column, row = place[:, 0], place[:, 1]
         own = self._cells(np.floor(row), np.floor(column))
@@ -114,8 +127,13 @@ def estimate_ground_surface(
     camera_height = settings.camera_height_m or field.camera_height()
     if math.isfinite(camera_height):
         field.grow(camera_height)
+    # The known heights are blurred with their neighbours; carried ones count a tenth.
+    known = np.isfinite(field.heights)
+    weight = known * np.where(field.measured, 1.0, 0.1)
+    total = cv2.GaussianBlur(weight * np.nan_to_num(field.heights), (5, 5), 1.0)
+    sums = cv2.GaussianBlur(weight, (5, 5), 1.0)
     return GroundSurface(
-        heights_m=_smooth(field.heights, field.measured),
+        heights_m=np.where(known, total / np.where(known, sums, 1.0), np.nan),
         cell_m=field.cell_m,
         origin_m=field.origin,
         camera_height_m=camera_height,
@@ -150,15 +168,27 @@ class _Field:
     def __init__(self, cloud: PointCloud, path: Float64, settings: GroundSettings) -> None:
         self.cell_m = cell = max(CELL_M, settings.reach_m / _MOST_RINGS)
         rings = math.ceil(settings.reach_m / cell)
-        path = np.concatenate([_densify(piece, cell / 2) for piece in _pieces(path)])
+        known = np.isfinite(path).all(axis=1)
+        pieces = np.split(path, np.flatnonzero(np.diff(known)) + 1)
+        known_pieces = [one for one in pieces if len(one) and np.isfinite(one[0]).all()]
+        path = np.concatenate([_densify(piece, cell / 2) for piece in known_pieces])
         low = np.floor(path[:, :2].min(axis=0) / cell) - rings
         columns, rows = (np.floor(path[:, :2].max(axis=0) / cell) - low + rings + 1).astype(int)
         self.origin = (float(low[0] * cell), float(low[1] * cell))
+        self._raster = Raster(self.origin, cell, (rows, columns))
         self.heights = np.full((rows, columns), np.nan)
         self.measured = np.zeros((rows, columns), dtype=np.bool_)
         self._gap = np.full((rows, columns), np.inf)
-        self._path_z = self._path_height(path)
-        self._ring = _rings(np.isfinite(self._path_z), rings)
+        # Mean height of the path in each cell that it crosses; NaN elsewhere.
+        cells, _ = self._raster.cells_of(path[:, :2])
+        number = np.bincount(cells, minlength=rows * columns)
+        total = np.bincount(cells, weights=path[:, 2], minlength=rows * columns)
+        mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+        self._path_z = mean.reshape(self.heights.shape)
+        # Steps, to 8 neighbours, from the nearest cell below the path.
+        away = np.where(np.isfinite(self._path_z), 0, 255).astype(np.uint8)
+        steps = np.rint(cv2.distanceTransform(away, cv2.DIST_C, 3)).astype(np.int32)
+        self._ring = np.where(steps <= rings, steps, _BEYOND).astype(np.int32)
         self._cell, self._z = self._points(cloud)
 
     def camera_height(self) -> float:
@@ -193,7 +223,7 @@ class _Field:
         """Fill ring after ring, from the path outward."""
         ring_of_point = self._ring.ravel()[self._cell]
         order = np.argsort(ring_of_point, kind="stable")
-        last = int(self._ring[self._ring < np.iinfo(np.int32).max].max())
+        last = int(self._ring[self._ring < _BEYOND].max())
         bounds = np.searchsorted(ring_of_point[order], np.arange(last + 2))
         for ring in range(last + 1):
             cells = np.flatnonzero(self._ring.ravel() == ring)
@@ -236,39 +266,15 @@ class _Field:
             gap = np.where(known, np.minimum(gap, self._gap[r, c]), gap)
         return np.where(number > 0, total / np.maximum(number, 1), np.nan), gap
 
-    def _path_height(self, path: Float64) -> Float64:
-        """Return mean height of the path in each cell that it crosses; NaN elsewhere."""
-        cells, _ = self._cells_of(path)
-        size = self.heights.size
-        number = np.bincount(cells, minlength=size)
-        total = np.bincount(cells, weights=path[:, 2], minlength=size)
-        mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
-        return np.asarray(mean.reshape(self.heights.shape))
-
     def _points(self, cloud: PointCloud) -> tuple[NDArray[np.intp], Float64]:
         xyz = cloud.xyz.astype(np.float64)
         if cloud.normals is not None:
             upright = math.cos(math.radians(MAX_TILT_DEG))
             xyz = xyz[cloud.normals[:, 2] >= upright]
-        cells, inside = self._cells_of(xyz)
+        cells, inside = self._raster.cells_of(xyz[:, :2])
         cells, z = cells[inside], xyz[inside, 2]
-        reached = self._ring.ravel()[cells] < np.iinfo(np.int32).max
+        reached = self._ring.ravel()[cells] < _BEYOND
         return cells[reached], z[reached]
-
-    def _cells_of(self, xyz: Float64) -> tuple[NDArray[np.intp], Bool]:
-        """Return flat index of the cell of each point, and whether it lies on the field."""
-        rows, columns = self.heights.shape
-        x, y = (np.floor((xyz[:, n] - self.origin[n]) / self.cell_m) for n in range(2))
-        inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
-        column, row = np.where(inside, (x, y), 0).astype(np.intp)
-        return row * columns + column, np.asarray(inside)
-
-
-def _pieces(path: Float64) -> list[Float64]:
-    """Return the runs of rows between those of NaN."""
-    known = np.isfinite(path).all(axis=1)
-    runs = np.split(path, np.flatnonzero(np.diff(known)) + 1)
-    return [run for run in runs if len(run) and np.isfinite(run[0]).all()]
 
 
 def _densify(path: Float64, step_m: float) -> Float64:
@@ -281,22 +287,6 @@ def _densify(path: Float64, step_m: float) -> Float64:
     return np.stack([np.interp(wanted, along, path[:, axis]) for axis in range(3)], axis=1)
 
 
-def _rings(seeds: Bool, reach: int) -> Int32:
-    """Return steps (to 8 neighbours) from the nearest seed; the largest int32 beyond ``reach``."""
-    away = np.where(seeds, 0, 255).astype(np.uint8)
-    steps = np.rint(cv2.distanceTransform(away, cv2.DIST_C, 3)).astype(np.int32)
-    return np.where(steps <= reach, steps, np.iinfo(np.int32).max).astype(np.int32)
-
-
-def _smooth(heights: Float64, measured: Bool) -> Float64:
-    """Blur the known heights with their neighbours; carried ones count a tenth."""
-    known = np.isfinite(heights)
-    weight = known * np.where(measured, 1.0, 0.1)
-    total = cv2.GaussianBlur(weight * np.nan_to_num(heights), (5, 5), 1.0)
-    sums = cv2.GaussianBlur(weight, (5, 5), 1.0)
-    return np.where(known, total / np.where(known, sums, 1.0), np.nan)
-
-
 _FULL: Final = log_odds(0.6)
 _EMPTY: Final = log_odds(0.45)
 _REACH: Final = 2
@@ -304,10 +294,7 @@ _REACH: Final = 2
 
 
 def find_floors(voxels: OccupancyVoxels) -> Float32:
-    """Return float32 (N, 3), centres of the occupied voxels with free space right above them.
-
-    Walls have none. Voxels on another column do not matter, so tiles can be looked at alone.
-    """
+    """Return float32 (N, 3), centres of the occupied voxels with free space right above them."""
     packed = pack_keys(voxels.keys)
     order = np.argsort(packed)
     packed, log_odds = packed[order], voxels.log_odds[order]
@@ -322,10 +309,7 @@ def find_floors(voxels: OccupancyVoxels) -> Float32:
 
 
 def add_floors(cloud: PointCloud, floors: Float32) -> PointCloud:
-    """Return a cloud to look for ground in: its points, and floors (N, 3) where it has too few.
-
-    It has normals if the cloud has them, straight up for floors.
-    """
+    """Return a cloud to look for ground in: its points, and floors (N, 3) where it has too few."""
     known = cloud.xyz
     if cloud.normals is not None:
         known = known[cloud.normals[:, 2] >= math.cos(math.radians(MAX_TILT_DEG))]

@@ -21,7 +21,7 @@ from recon.core.geometry.se3 import apply
 from recon.core.settings import Settings
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Bool, Float64, Int64
-from recon.map.ground.surface import GroundSurface
+from recon.map.ground.surface import GroundSurface, Raster
 
 UNSURE: Final = -2
 """A cell that was seen, but not well enough to tell whether a robot can drive there."""
@@ -60,24 +60,8 @@ class RobotSettings(Settings):
 
     @property
     def step_m(self) -> float:
-        """The highest step."""
         ratio = 2 * FRICTION**2 / (1 + FRICTION**2)
         return ratio * self.wheel_radius_m if self.max_step_m is None else self.max_step_m
-
-
-class Raster(NamedTuple):
-    """Square cells seen from above; row 0 has the smallest y."""
-
-    origin_m: tuple[float, float]  # x and y of the outer corner of cell (0, 0)
-    cell_m: float
-    shape: tuple[int, int]  # rows, columns
-
-    def cells_of(self, xy_m: Float64) -> tuple[Int64, Bool]:
-        """Return the flat index of the cell of each place (N, 2), and whether there is one."""
-        column, row = np.floor((xy_m - self.origin_m) / self.cell_m).astype(np.int64).T
-        rows, columns = self.shape
-        inside = (row >= 0) & (column >= 0) & (row < rows) & (column < columns)
-        return row * columns + column, np.asarray(inside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,16 +96,20 @@ def measure_relief(
             sigma_m = cloud.sigma_m[used].astype(np.float64)
             cells, values = _one_frame(cell[used], rays, height, sigma_m, _WINDOW_PX / focal_px)
             sums[cells] += values
-    return _relief(sums, raster)
+    total, z, zz, variance, squares, *blur = sums.T.reshape(-1, *raster.shape)
+    # What few frames saw may have moved, or be mismatched.
+    weight = np.where((total > 0) & (total**2 >= _FRAMES * squares), total, np.nan)
+    height_m = z / weight
+    # As much as frames and points of a cell differ, if that is more than they say.
+    scatter = np.maximum(zz / weight - height_m**2, 0.0) * squares / weight**2
+    sigma_m = np.sqrt(np.maximum(variance / weight**2, scatter) + _LEAST_SIGMA_M**2)
+    return Relief(raster, height_m, sigma_m, np.stack([one / weight for one in blur]))
 
 
 def _one_frame(
     cell: Int64, rays: Float64, height_m: Float64, sigma_m: Float64, blur_rad: float
 ) -> tuple[Int64, Float64]:
-    """Return cells, each once, and what is added to their sums (N, 8).
-
-    The errors of neighbouring points of a frame are alike, so all of a cell are one measurement.
-    """
+    """Return cells, each once, and what is added to their sums (N, 8)."""
     away, level = np.linalg.norm(rays, axis=1), np.linalg.norm(rays[:, :2], axis=1)
     sine = np.maximum(np.abs(rays[:, 2]) / away, _FLATTEST)
     along, across = np.hypot(sigma_m * level / away, blur_rad * away / sine), blur_rad * away
@@ -133,17 +121,6 @@ def _one_frame(
     z, zz, sigma, xx, xy, yy = [np.bincount(home, one) for one in columns] / np.bincount(home)
     w = 1 / (xx + yy)  # sharp views count more
     return cells, np.stack([w, w * z, w * zz, (w * sigma) ** 2, w**2, w * xx, w * xy, w * yy], 1)
-
-
-def _relief(sums: Float64, raster: Raster) -> Relief:
-    total, z, zz, variance, squares, *blur = sums.T.reshape(-1, *raster.shape)
-    # What few frames saw may have moved, or be mismatched.
-    weight = np.where((total > 0) & (total**2 >= _FRAMES * squares), total, np.nan)
-    height_m = z / weight
-    # As much as frames and points of a cell differ, if that is more than they say.
-    scatter = np.maximum(zz / weight - height_m**2, 0.0) * squares / weight**2
-    sigma_m = np.sqrt(np.maximum(variance / weight**2, scatter) + _LEAST_SIGMA_M**2)
-    return Relief(raster, height_m, sigma_m, np.stack([one / weight for one in blur]))
 
 
 class Judged(NamedTuple):

@@ -102,12 +102,7 @@ def _normals(cells: Int32, points: _Points, *, last: bool) -> tuple[Float64, Boo
 
 @kernel
 def _measure_spreads(
-    cells: Int32,
-    table: Int64,
-    sums: Float64,
-    spreads: Float64,
-    variances: Float64,
-    number: Int64,
+    cells: Int32, table: Int64, sums: Float64, spreads: Float64, variances: Float64, number: Int64
 ) -> None:
     """Write covariance (N, 3, 3), mean variance and number of the points around each cell."""
     points, weights = np.empty((27, 3)), np.empty(27)

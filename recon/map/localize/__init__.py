@@ -2,6 +2,5 @@
 
 - `sequence.py`: a whole drive; `localizer.py`: frame by frame, search or track, or a single pair;
 - `belief.py`: the pose and its covariance, from one frame to the next;
-- `surroundings.py`: the pose corrected by the surfaces of the map (`surfaces.py`), where it is
-  worth it.
+- `surroundings.py`: the pose corrected by the surfaces of the map, where it is worth it.
 """

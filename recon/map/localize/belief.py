@@ -52,7 +52,6 @@ class Belief:
 
     @property
     def certain(self) -> bool:
-        """Whether the pose is certain enough to be given out."""
         return self.sigma_m <= self.scale * MAX_SIGMA_M and self.sigma_deg <= MAX_SIGMA_DEG
 
     def moved(self, T_before_now: Float64, covariance: Float64, path_m: float) -> Belief:

@@ -6,21 +6,19 @@ Where the map confirms nothing, odometry goes on alone until its drift makes the
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from recon.core.geometry.se3 import covariance_of, invert, step_covariance
 from recon.core.text import counted
-from recon.core.values import RectifiedCamera, Rig, StereoPair
+from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.map.localize.belief import MAX_SIGMA_M, Belief
 from recon.map.localize.surroundings import Surroundings
-from recon.map.settings import DriveSettings
-from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.visual import VisualEstimate, VisualOdometry
 from recon.places.closure import loop_bias
@@ -28,7 +26,6 @@ from recon.places.detector import KnownPlaces
 from recon.places.keyframe import Keyframe, make_keyframe
 from recon.places.loop import Loop, agreeing_loops
 from recon.places.places import path_lengths
-from recon.stereo.frame import FrameReconstructor
 
 _VIEWS: Final = 2  # nearest views of the map that each frame is compared with
 _SURFACES_EVERY: Final = 3
@@ -228,16 +225,6 @@ class Localizer:
         )
 
 
-def localize_pair(
-    map_: MapFile, pair: StereoPair, calibration: Rig, config: DriveSettings | None
-) -> Located:
-    """Find where a single pair was taken; see `Map.localize`."""
-    reconstructor = FrameReconstructor(calibration, config or DriveSettings())
-    # Several views of the map must show the place, since no second frame confirms it.
-    localizer = Localizer(known_places(map_), frames=1)
-    return localizer.add(OdometryFrame(*reconstructor.match(pair)))
-
-
 _REMEMBERED: Final = 10  # frames whose recognised places still count
 _NEIGHBOURS: Final = 3  # views around a recognised place that must show it, too
 
@@ -266,43 +253,30 @@ class FirstFix:
     ) -> Loop | None:
         """Return the best believed loop to the next frame, ``path_m`` into the drive, if any.
 
-        Behind one of the ``breaks`` of the odometry no frame before says where it is: several views
-        of the map are enough.
+        Behind a break of the odometry several views of the map are enough.
         """
         at = (T_odometry_camera, path_m, breaks)
         options = {"most": _ANYWHERE} if breaks and not hurried else {}
         recognised = self._known.recognise(keyframe, camera, self._among, **options)
-        self._seen.append((at, self._around(recognised.loops, keyframe, camera)))
-        believed = [loop for loop in self._agreeing() if loop.last == keyframe.frame]
+        found = {loop.first: loop for loop in recognised.loops}
+        for loop in [*found.values()]:
+            # Views around a recognised one must show the place, too.
+            T_world_camera = self._known.T_world_camera[loop.first] @ loop.T_first_last
+            for number in self._known.near(T_world_camera, _NEIGHBOURS):
+                other = None if number in found else self._known.compare(number, keyframe, camera)
+                if other is not None and other.loop is not None:
+                    found[number] = other.loop
+        self._seen.append((at, [*found.values()]))
+        loops = [loop for _, loops in self._seen for loop in loops]
+        # The map is a rigid thing: only the drive in it drifts.
+        firsts = {loop.first: (self._known.T_world_camera[loop.first], 0.0, 0) for loop in loops}
+        lasts = {loop.last: at for at, loops in self._seen for loop in loops}
+        alone = breaks > 0 and sum(at[2] == breaks for at, _ in self._seen) == 1
+        needed, scale = 1 if alone else self._frames, self._known.scale
+        agreeing = agreeing_loops(loops, firsts, lasts, keyframes=needed, scale=scale)
+        believed = [loop for loop in agreeing if loop.last == keyframe.frame]
         if not believed:
             return None
         self._seen.clear()
         self._among = None  # once lost, the drive may be anywhere
         return max(believed, key=lambda loop: loop.inliers)
-
-    def _around(
-        self, recognised: Sequence[Loop], keyframe: Keyframe, camera: RectifiedCamera
-    ) -> list[Loop]:
-        """Return loops from recognised views and from those around them, each view once."""
-        known = self._known
-        found = {loop.first: loop for loop in recognised}
-        for loop in list(found.values()):
-            for number in known.near(
-                known.T_world_camera[loop.first] @ loop.T_first_last, _NEIGHBOURS
-            ):
-                other = None if number in found else known.compare(number, keyframe, camera)
-                if other is not None and other.loop is not None:
-                    found[number] = other.loop
-        return list(found.values())
-
-    def _agreeing(self) -> list[Loop]:
-        loops = [loop for _, loops in self._seen for loop in loops]
-        if not loops:
-            return []
-        # The map is a rigid thing: only the drive in it drifts.
-        firsts = {loop.first: (self._known.T_world_camera[loop.first], 0.0, 0) for loop in loops}
-        lasts = {loop.last: at for at, loops in self._seen for loop in loops}
-        breaks = self._seen[-1][0][2]
-        alone = breaks > 0 and sum(at[2] == breaks for at, _ in self._seen) == 1
-        how: Any = {"keyframes": 1 if alone else self._frames, "scale": self._known.scale}
-        return agreeing_loops(loops, firsts, lasts, **how)

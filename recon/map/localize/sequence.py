@@ -38,7 +38,6 @@ class StartPose:
     yaw_deg: float
 
     def near(self, T_map_camera: Float64) -> Bool:
-        """Return bool (N,), which of these poses (N, 4, 4) are near."""
         off = T_map_camera[:, :2, 3] - (self.x_m, self.y_m)
         c, s = math.cos(math.radians(self.yaw_deg)), math.sin(math.radians(self.yaw_deg))
         ahead = T_map_camera[:, :2, 2] @ np.array([[c, -s], [s, c]])

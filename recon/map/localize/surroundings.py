@@ -22,11 +22,12 @@ from recon.core.geometry.se3 import (
     distance_in_sigmas,
     invert,
     step_covariance,
+    step_jacobian,
 )
-from recon.core.values.arrays import Float64
+from recon.core.kernels.voxels import find_keys, pack_keys
+from recon.core.values.arrays import Float64, Int64
 from recon.io.files import reading
 from recon.map.localize.belief import MAX_SIGMA_DEG, MAX_SIGMA_M, Belief
-from recon.map.localize.surfaces import Fit, Surfaces, describe_surfaces, fit_surfaces, misfit
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.kiss import IcpAlignment, KissIcp, KissIcpOptions, select_points
@@ -94,7 +95,15 @@ class Surroundings:
         points = select_points(frame, self._range_m)
         if len(points) < _MIN_POINTS:
             return None
-        measured = self._measure(belief, points.xyz.astype(np.float64))
+        T_prior = belief.T_world_camera
+        alignment = self.align(points.xyz.astype(np.float64), T_prior)
+        T_icp, source = alignment.T_world_camera, alignment.source
+        measured = Correction(
+            step=as_step(invert(T_prior) @ T_icp),
+            before=_fit(source, T_prior, self._surfaces),
+            after=_fit(source, T_icp, self._surfaces),
+            contrast=contrast(source, T_icp, self._surfaces),
+        )
         correction = replace(measured, step=measured.step - self._offset)
         if learn:
             self._measured += 1
@@ -102,7 +111,7 @@ class Surroundings:
             self._offset = (1.0 - ratio) * self._offset + ratio * measured.step
         if not is_worthwhile(correction, belief.covariance):
             return None
-        T = belief.T_world_camera @ as_transform(correction.step)
+        T = T_prior @ as_transform(correction.step)
         return belief.corrected_to(T, icp_covariance(correction.after))
 
     def align(self, xyz: Float64, T_world_guess: Float64) -> IcpAlignment:
@@ -111,17 +120,6 @@ class Surroundings:
         limits = self._scale * _THRESHOLD_M, self._scale**2 * _KERNEL_M2
         return self._icp.align(xyz, T_world_guess, *limits)
 
-    def _measure(self, belief: Belief, xyz: Float64) -> Correction:
-        T_prior = belief.T_world_camera
-        alignment = self.align(xyz, T_prior)
-        T_icp = alignment.T_world_camera
-        return Correction(
-            step=as_step(invert(T_prior) @ T_icp),
-            before=_fit(alignment.source, T_prior, self._surfaces),
-            after=_fit(alignment.source, T_icp, self._surfaces),
-            contrast=contrast(alignment.source, T_icp, self._surfaces),
-        )
-
     def _load(self, camera_m: Float64) -> None:
         """Take the points around a position into the map of ICP, unless they are there."""
         reload_m = self._scale * _RELOAD_M
@@ -129,7 +127,11 @@ class Surroundings:
             return
         self._loaded_at = np.array(camera_m)
         reach_m = self._range_m + reload_m
-        near = [p for p in self._parts if _distance_m(p.cameras_m, camera_m) <= reach_m]
+        near = [
+            part
+            for part in self._parts
+            if np.linalg.norm(part.cameras_m - camera_m, axis=1).min(initial=np.inf) <= reach_m
+        ]
         xyz = np.concatenate([np.zeros((0, 3)), *(part.points() for part in near)])
         xyz = xyz[np.linalg.norm(xyz - camera_m, axis=1) <= reach_m]
         self._icp.set_map(xyz)
@@ -158,10 +160,6 @@ def _parts(map_: MapFile, session: Session) -> Iterator[_Part]:
             continue
         T = T_map_session if corrections is None else T_map_session @ corrections[entry.index]
         yield _Part(session, entry.index, T, cameras_m[frames])
-
-
-def _distance_m(positions_m: Float64, place_m: Float64) -> float:
-    return float(np.linalg.norm(positions_m - place_m, axis=1).min(initial=np.inf))
 
 
 def _fit(xyz_camera: Float64, T_world_camera: Float64, surfaces: Surfaces) -> Fit:
@@ -209,7 +207,11 @@ def is_worthwhile(correction: Correction, prior_covariance: Float64) -> bool:
         return False
     both = prior_covariance + icp_covariance(after)
     likely = distance_in_sigmas(step, both) <= MAX_SIGMAS
-    return after.overlap >= _MIN_OVERLAP and likely and _gain(prior_covariance, both) >= _MIN_RATIO
+    # Whitened by `both = L·Lᵀ`, the Kalman gain `prior·both⁻¹` is symmetric.
+    L = np.linalg.cholesky(both)
+    white = np.linalg.solve(L, np.linalg.solve(L, prior_covariance).T)
+    gain = float(np.linalg.eigvalsh(white)[-1])
+    return after.overlap >= _MIN_OVERLAP and likely and gain >= _MIN_RATIO
 
 
 def icp_covariance(fit: Fit) -> Float64:
@@ -218,11 +220,90 @@ def icp_covariance(fit: Fit) -> Float64:
     return covariance_of(_ICP_INDEPENDENCE * fit.information) + floor
 
 
-def _gain(prior: Float64, both: Float64) -> float:
-    """Return the Kalman gain in the direction in which it is largest.
+MIN_POINTS = 10  # least number of points in a cell with a surface
+THIN_RATIO = 0.1
+"""A cell is thin along an axis where its points spread by less than this fraction of its edge.
 
-    Whitened by ``both = L·Lᵀ``, the gain ``prior·both⁻¹`` is symmetric.
+Points that fill a cell evenly spread by 0.29 of its edge (1/√12)."""
+NOISE = (
+    0.02  # standard deviation that is added to that of every surface, as a fraction of that edge
+)
+FAR_CHI2 = 9.0
+"""Points three standard deviations from the surface of their cell count like those without one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Cells of a map, each with its mean and its surface."""
+
+    edge_m: float  # edge of a cell
+    keys: Int64  # int64 (M,), packed cell indices, ascending
+    means: Float64  # (M, 3), mean of the points in each cell
+    # float64 (M, 3, 3), inverse covariance along the thin axes, zero along the others: a wall fixes
+    # one direction, a pole two, a bush none
+    information: Float64
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """How points fit surfaces."""
+
+    overlap: float  # fraction of points that lie in a cell of the map
+    residual_m: float  # median distance of points to the surface of their cell; NaN = no surface
+    # float64 (6, 6), of a step (translation in metres, rotation vector in radians) of their frame
+    information: Float64
+    edge_m: float = 1.0  # edge of the cells
+
+
+def describe_surfaces(xyz: Float64, edge_m: float) -> Surfaces:
+    """Fit a surface to the points in each cell of a cloud (N, 3).
+
+    Ref: Biber and Straßer, "The normal distributions transform", IROS 2003.
     """
-    L = np.linalg.cholesky(both)
-    white = np.linalg.solve(L, np.linalg.solve(L, prior).T)
-    return float(np.linalg.eigvalsh(white)[-1])
+    keys, cell, count = np.unique(_keys(xyz, edge_m), return_inverse=True, return_counts=True)
+    means = _sums(cell, xyz, len(keys)) / count[:, None]
+    off = xyz - means[cell]
+    products = np.einsum("ni,nj->nij", off, off).reshape(-1, 9)
+    covariance = _sums(cell, products, len(keys)).reshape(-1, 3, 3) / count[:, None, None]
+    spread, axes = np.linalg.eigh(covariance)
+    thin = np.sqrt(np.maximum(spread, 0.0)) < THIN_RATIO * edge_m
+    strength = np.where(thin, 1.0 / (np.maximum(spread, 0.0) + (NOISE * edge_m) ** 2), 0.0)
+    information: Float64 = np.einsum("mik,mk,mjk->mij", axes, strength, axes)
+    information[count < MIN_POINTS] = 0.0
+    return Surfaces(edge_m, keys, means, information)
+
+
+def fit_surfaces(xyz: Float64, surfaces: Surfaces) -> Fit:
+    """Return how points (N, 3), in the axes of the surfaces, fit them."""
+    cell, hit = find_keys(_keys(xyz, surfaces.edge_m), surfaces.keys)
+    overlap = float(hit.mean()) if len(hit) else 0.0
+    flat = np.flatnonzero(hit)[surfaces.information[cell[hit]].any(axis=(1, 2))]
+    if not len(flat):
+        return Fit(overlap, float("nan"), np.zeros((6, 6)), surfaces.edge_m)
+    near, information = xyz[flat], surfaces.information[cell[flat]]
+    off = near - surfaces.means[cell[flat]]
+    # Distances along the thin axes: Mahalanobis distances, scaled to metres.
+    square = np.einsum("ni,nij,nj->n", off, information, off)
+    strength = np.einsum("nii->n", information)
+    residual_m = float(np.median(np.sqrt(np.maximum(square, 0.0) / strength)))
+    J = step_jacobian(near)
+    total = np.einsum("nki,nkl,nlj->ij", J, information, J, optimize=True)
+    return Fit(overlap, residual_m, total, surfaces.edge_m)
+
+
+def misfit(xyz: Float64, surfaces: Surfaces) -> float:
+    """Return how badly points (N, 3) fit: squared distances in standard deviations, summed up."""
+    cell, hit = find_keys(_keys(xyz, surfaces.edge_m), surfaces.keys)
+    off, information = xyz[hit] - surfaces.means[cell[hit]], surfaces.information[cell[hit]]
+    square = np.einsum("ni,nij,nj->n", off, information, off, optimize=True)
+    square[~information.any(axis=(1, 2))] = FAR_CHI2
+    return float(np.minimum(square, FAR_CHI2).sum()) + FAR_CHI2 * float((~hit).sum())
+
+
+def _keys(xyz: Float64, edge_m: float) -> Int64:
+    return pack_keys(np.floor(xyz / edge_m).astype(np.int64))
+
+
+def _sums(cell: Int64, values: Float64, cells: int) -> Float64:
+    columns = [np.bincount(cell, weights=column, minlength=cells) for column in values.T]
+    return np.stack(columns, axis=1)

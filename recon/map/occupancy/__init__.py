@@ -3,5 +3,5 @@
 - `part.py`: the occupancy of one submap, to be chained with others, and where in its cells the
   surface is;
 - `moving.py`: which points moved: candidates by their sums, judged in `bodies.py` by what single
-  frames saw of them, unless `error.py` explains it.
+  frames saw of them, unless the error of depths explains it.
 """

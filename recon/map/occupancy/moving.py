@@ -14,7 +14,7 @@ straight edge on the ground it is three of eight, and nothing grows.
 
 Then what single frames saw decides (`bodies.py`): fences, hedges, edges and noise are looked
 through as well, but no frame sees a whole piece of them gone. Nor did a piece move whose surface is
-still there, beside it by no more than the error of depths (`error.py`). A point that its frames
+still there, beside it by no more than the error of depths. A point that its frames
 could not place in a voxel stays if something occupied is in its reach.
 
 The ground is in reach of the lowest part of what moved, outvotes the voxels that touch it, and
@@ -41,12 +41,13 @@ from recon.map.builders import (
 )
 from recon.map.occupancy.bodies import (
     FrameObservations,
+    Reaches,
     dynamic_cells,
     pairs_of,
     pieces_of,
+    still_there,
     strides,
 )
-from recon.map.occupancy.error import Reaches, still_there
 from recon.map.occupancy.part import OccupancyPart
 
 _FREE: Final = np.float32(log_odds(0.35))
@@ -114,7 +115,11 @@ def find_moved(
         moved[moved], by_error = body, reaches.cells[body]
         for sigmas in _SIGMAS:
             rows = np.flatnonzero(moved)
-            stays = _is_beside(keys[rows], sigmas * by_error, occupied)
+            # Bodies of which at least half has a surface in its reach.
+            others = np.sort(occupied[~are_among(occupied, keys[rows])])
+            beside = still_there(keys[rows], sigmas * by_error, others)
+            piece = pieces_of(len(rows), pairs_of(keys[rows])[0])
+            stays = (np.bincount(piece, beside - 0.5) >= 0)[piece]
             moved[rows[stays]], by_error = False, by_error[~stays]
             if moved[home[counted]].sum() <= _MUCH * counted.sum():
                 break
@@ -129,10 +134,7 @@ def find_moved(
 
 
 def _left_below(points: Float64, packed: Int64, moved: Bool, finest: FrameObservations) -> Bool:
-    """Return bool (N,), points (N, 3) below those that moved whose finest cells were mostly free.
-
-    ``packed`` (N,) are their voxels.
-    """
+    """Return bool (N,), points below those that moved whose finest cells were mostly free."""
     rows = np.flatnonzero(~moved)
     rows = rows[_touching(packed[rows], np.unique(packed[moved]), _ABOVE) > 0]
     found = np.zeros(len(points), np.bool_)
@@ -142,13 +144,6 @@ def _left_below(points: Float64, packed: Int64, moved: Bool, finest: FrameObserv
         seen = sum((_OF_LOOK[look] for look in finest.at(keys)), np.zeros(len(keys)))
         found[rows] = (seen < 0)[home]
     return found
-
-
-def _is_beside(keys: Int64, reach: Float64, occupied: Int64) -> Bool:
-    """Return bool (N,), cells of bodies of which at least half has a surface in its reach."""
-    beside = still_there(keys, reach, np.sort(occupied[~are_among(occupied, keys)]))
-    piece = pieces_of(len(keys), pairs_of(keys)[0])
-    return np.asarray((np.bincount(piece, beside - 0.5) >= 0)[piece])
 
 
 def _among(home: Int64, points: Bool) -> Bool:
@@ -161,10 +156,7 @@ def _among(home: Int64, points: Bool) -> Bool:
 def _mostly_free(
     keys: Int64, tells: Bool, voxels: OccupancyVoxels, evidence: CellEvidence
 ) -> tuple[Bool, Bool]:
-    """Return bool (N,), sorted cells with points around which most of those that tell are free.
-
-    And bool (N,), which are free themselves.
-    """
+    """Return two bool (N,): around which sorted cells most are free; which are free."""
     place, known = find_keys(keys, evidence[0])
     seen = np.full(len(keys), _MOST)
     seen[known] = evidence[1][place[known]]
@@ -172,7 +164,14 @@ def _mostly_free(
     # What was there when the drive ended, and is free in the end, another drive looked through:
     # a later one; or an earlier one, where this one hit it hardly more often than by chance.
     seen[free_in_the_end & (seen > _FREE)] = -_MOST
-    mean = _mean_around(keys, keys[tells], seen[tells])
+    # Of those that touch each one; NaN where there are none.
+    total, number = np.zeros((2, len(keys)), np.float32)
+    among, values = keys[tells], seen[tells]
+    for stride in strides(_AROUND):
+        place, known = find_keys(keys + stride, among)
+        total[known] += values[place[known]]
+        number += known
+    mean = np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
     return _grown(keys, mean <= 0, mean <= _UNSURE), np.asarray(seen <= 0)
 
 
@@ -196,16 +195,6 @@ def _touching(wanted: Int64, keys: Int64, steps: Int64) -> Int64:
     return number
 
 
-def _mean_around(wanted: Int64, keys: Int64, values: Float32) -> Float32:
-    """Return float32 (N,), mean value of the sorted keys that touch each wanted one, or NaN."""
-    total, number = np.zeros((2, len(wanted)), np.float32)
-    for stride in strides(_AROUND):
-        place, known = find_keys(wanted + stride, keys)
-        total[known] += values[place[known]]
-        number += known
-    return np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0)
-
-
 def _in_reach(places: Float64, reach: Float32, keys: Int64) -> Bool:
     """Return bool (N,): places with one of the adjacent sorted keys in reach; in cells."""
     cells = np.floor(places).astype(np.int64)
@@ -217,9 +206,6 @@ def _in_reach(places: Float64, reach: Float32, keys: Int64) -> Bool:
     return near
 
 
-_EVEN: Final = np.float32(0)
-
-
 def looked_through(points: Float32, voxels: OccupancyVoxels) -> Bool:
     """Return bool (N,), points (N, 3) whose voxel is free, with no occupied one that touches it.
 
@@ -228,10 +214,8 @@ def looked_through(points: Float32, voxels: OccupancyVoxels) -> Bool:
     """
     cells = np.floor(points / np.float32(voxels.resolution_m)).astype(np.int64)
     keys = pack_keys(voxels.keys)
-    _, through = find_keys(pack_keys(cells), np.sort(keys[voxels.log_odds <= _EVEN]))
+    _, through = find_keys(pack_keys(cells), np.sort(keys[voxels.log_odds <= 0]))
     occupied = np.sort(keys[voxels.log_odds > 0])
     rows = np.flatnonzero(through)
-    for step in product((-1, 0, 1), repeat=3):
-        _, near = find_keys(pack_keys(cells[rows] + np.array(step)), occupied)
-        through[rows[near]] = False
+    through[rows] = _touching(pack_keys(cells[rows]), occupied, _AROUND) == 0
     return through

@@ -17,7 +17,7 @@ from recon.core.geometry.se3 import apply
 from recon.core.kernels import voxels
 from recon.core.kernels.voxels import are_among
 from recon.core.values import OccupancyVoxels
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, array_in, frozen_array
+from recon.core.values.arrays import Float32, Float64, Int32, Int64, array_in, frozen_array
 from recon.map.kernels import clamped, facets, raycast
 from recon.map.kernels.raycast import BLOCK_BITS
 
@@ -56,18 +56,28 @@ class OccupancyPart:
         sizes = np.diff(self.rows.starts)
         cells = np.repeat(which, sizes)
         starts = np.concatenate([[0], np.cumsum(sizes[which])]).astype(np.int64)
-        blocks = self.rows.blocks[which]
-        return OccupancyPart(
-            clamped.CellRows(blocks, starts, self.rows.cells[cells], self.rows.values[cells]),
-            None if self.points is None else self.points.in_blocks(blocks),
-        )
+        blocks, points = self.rows.blocks[which], self.points
+        if points is not None:
+            home = voxels.pack_keys(voxels.unpack_keys(points.keys) >> BLOCK_BITS)
+            points = points.select(are_among(home, blocks))
+        rows = clamped.CellRows(blocks, starts, self.rows.cells[cells], self.rows.values[cells])
+        return OccupancyPart(rows, points)
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> OccupancyPart:
         """Return the part that a tree (`tree_of`) is of."""
-        points = tree["points"]
-        rows = _rows_in(tree["rows"])
-        return cls(rows, None if points is None else SurfacePoints.from_tree(points))
+        rows, points = tree["rows"], tree["points"]
+        blocks = array_in(rows, "blocks", np.int64, (None,))
+        starts = array_in(rows, "starts", np.int64, (len(blocks) + 1,))
+        cells = array_in(rows, "cells", np.uint16, (None,))
+        values = frozen_array("values", rows["values"], np.float32, (len(cells), 3))
+        # Compiled loops will trust them.
+        whole = (starts[0], starts[-1]) == (0, len(cells)) and (np.diff(starts) >= 0).all()
+        inside = blocks.min(initial=0) >= 0 and cells.max(initial=0) < raycast.BLOCK_CELLS
+        if not (whole and inside) or np.isnan(values).any():
+            raise FormatError("a submap of the map has an impossible cell")
+        found = clamped.CellRows(blocks, starts, cells, rows["values"])
+        return cls(found, None if points is None else SurfacePoints.from_tree(points))
 
     def moved(self, T_new_map: Float64, resolution_m: float) -> OccupancyPart:
         """Return the part after a rigid motion: a cell gets the values that were at its centre."""
@@ -101,35 +111,13 @@ class OccupancyPart:
         if blocks is not None:
             wanted = np.repeat(are_among(self.rows.blocks, blocks), np.diff(self.rows.starts))
         if self.points is not None:
-            log_odds = _thinned(cells, log_odds, self.points, wanted)
+            hit = log_odds > _UNSURE
+            # What was hit and then looked through is no surface: a car that drove off, an outlier.
+            among = are_among(self.points.keys, voxels.pack_keys(cells[hit]))
+            points, rows = self.points.select(among), np.flatnonzero(hit & wanted)
+            crossed = facets.crossed_cells(cells[rows], points.keys, points.sums)
+            log_odds[rows[~crossed]] = _UNSURE
         return OccupancyVoxels(cells, log_odds, resolution_m).select(wanted)
-
-
-def _rows_in(tree: Mapping[str, Any]) -> clamped.CellRows:
-    """Return rows of cells, which compiled loops will trust."""
-    blocks = array_in(tree, "blocks", np.int64, (None,))
-    starts = array_in(tree, "starts", np.int64, (len(blocks) + 1,))
-    cells = array_in(tree, "cells", np.uint16, (None,))
-    values = frozen_array("values", tree["values"], np.float32, (len(cells), 3))
-    whole = (starts[0], starts[-1]) == (0, len(cells)) and (np.diff(starts) >= 0).all()
-    inside = blocks.min(initial=0) >= 0 and cells.max(initial=0) < raycast.BLOCK_CELLS
-    if not (whole and inside) or np.isnan(values).any():
-        raise FormatError("a submap of the map has an impossible cell")
-    return clamped.CellRows(blocks, starts, cells, tree["values"])
-
-
-def _thinned(cells: Int32, log_odds: Float32, points: SurfacePoints, wanted: Bool) -> Float32:
-    """Return log-odds (N,) of cells (N, 3), no more than unsure where no surface crosses.
-
-    Those that are not ``wanted`` stay.
-    """
-    hit = log_odds > _UNSURE
-    # What was hit and then looked through is no surface: a car that drove off, an outlier.
-    points = points.select(are_among(points.keys, voxels.pack_keys(cells[hit])))
-    hit = np.flatnonzero(hit & wanted)
-    crossed = facets.crossed_cells(cells[hit], points.keys, points.sums)
-    log_odds[hit[~crossed]] = _UNSURE
-    return log_odds
 
 
 def join_occupancy(parts: Iterable[OccupancyPart]) -> OccupancyPart:
@@ -185,11 +173,6 @@ class SurfacePoints:
     def select(self, which: NDArray[Any]) -> SurfacePoints:
         """Return the rows of a boolean mask or of an index array, in that order."""
         return SurfacePoints(self.keys[which], self.sums[which])
-
-    def in_blocks(self, blocks: Int64) -> SurfacePoints:
-        """Return the cells that lie in some packed blocks."""
-        home = voxels.pack_keys(voxels.unpack_keys(self.keys) >> BLOCK_BITS)
-        return self.select(are_among(home, blocks))
 
     def moved(self, T_new_map: Float64) -> SurfacePoints:
         """Return the sums after a rigid motion in cells; a cell moves as its mean point does."""

@@ -1,7 +1,8 @@
 """Several drives in one map: copied into it, linked, placed, and taken out again.
 
-- `copying.py`: drives go from one map into another;
+- `copying.py`: drives go from one map into another, or into the file that is kept;
 - `joining.py`: places that two of them saw link them; linked ones are placed in one pose graph;
 - `measured.py`: positions that were measured along them, such as by GNSS;
-- `placed.py`: the map is cut into tiles, by one process or several.
+- `placed.py`: occupancy is made from kept rays again, and the map cut into tiles, by one process or
+  several.
 """

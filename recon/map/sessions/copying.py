@@ -1,10 +1,11 @@
-"""Drives that go from one map into another: as drives of their own, or as one after the other."""
+"""Drives that go from one map into another, or into one file that is kept, also piece by piece."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from itertools import chain
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -13,14 +14,16 @@ from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import orthonormalise
 from recon.core.text import counted
 from recon.core.values.arrays import Float64
+from recon.map.builders import Submap
+from recon.map.kernels import clamped
+from recon.map.occupancy.part import OccupancyPart
 from recon.map.sessions.joining import T_one_other, link_by_frame
+from recon.map.sessions.placed import check_rays
 from recon.map.settings import DriveSettings
-from recon.map.store.finished import check_rays
 from recon.map.store.map_file import MapFile
 from recon.map.store.records import Key
-from recon.map.store.session import AXES, ENTRY, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
+from recon.map.store.session import AXES, ENTRY, IMAGES, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
 from recon.map.store.trees import FRAMES, RAYS, RIG
-from recon.map.submaps import Submap
 from recon.odometry.health import segment_numbers
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.places import path_lengths
@@ -34,13 +37,30 @@ def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = (
     They keep their numbers where the other map is empty, else they get the next ones.
     """
     chosen = [session for session in source.sessions if session.number not in without]
-    for session in chosen:
-        _refuse_again(session, target)
+    known = [other.odometry for other in target.sessions]
+    for session in chosen:  # one that a map has already would be evidence of its own
+        path = session.odometry
+        if any(
+            np.array_equal(other.T_world_camera, path.T_world_camera)
+            and np.array_equal(other.timestamps_s, path.timestamps_s)
+            for other in known
+        ):
+            raise FormatError(
+                "the map has this drive already",
+                where=session.where,
+                got=f"{session.info.source}, {counted(len(session), 'frame')}",
+                expected="another drive",
+            )
     after = max((session.number for session in target.sessions), default=-1) + 1
     first = chosen[0].number if chosen and after else 0
     numbers = {session.number: session.number - first + after for session in chosen}
     for kind in _KINDS:
-        source.store.copy(kind, target.store, _renumbered(source.store.keys(kind), numbers))
+        keys: dict[Key, Key] = {}
+        for key in source.store.keys(kind):
+            number, *rest = key if isinstance(key, tuple) else (key,)
+            if number in numbers:
+                keys[key] = (numbers[number], *rest) if rest else numbers[number]
+        source.store.copy(kind, target.store, keys)
     linked = [numbers[s.number] for s in source.linked if s.number in numbers]
     links = [
         replace(link, sessions=(numbers[link.sessions[0]], numbers[link.sessions[1]]))
@@ -76,7 +96,16 @@ def join_parts(
             (part.number, frame): (session.number, begin + frame) for frame in rays if frame >= lead
         }
         part_map.store.copy(RAYS, map_.store, own)
-        _append_submaps(session, part, lead, T_world_part, settings.fusion.voxel_m)
+        for one in part.submaps:
+            frames = one.frames - max(0, lead - one.first_frame)
+            if frames > 0:
+                # Occupancy is made of rays, as where they lie is known now.
+                nothing = one.occupancy.select(np.zeros(len(one.occupancy.rows.blocks), np.bool_))
+                fused = one.fused
+                if lead:
+                    fused = fused.moved(T_world_part, settings.fusion.voxel_m).rounded()
+                number, first = len(session.submaps), session.submaps.frames
+                session.submaps.add(Submap(number, first, frames, fused, nothing))
         poses = session.odometry.T_world_camera
         path_m = path_lengths(poses, session.trusted, settings.scale)
         segment = segment_numbers(session.health)
@@ -86,6 +115,24 @@ def join_parts(
                 keyframe = replace(stored.keyframe, frame=frame)
                 pose, along_m = poses[frame], float(path_m[frame])
                 detector.look(StoredKeyframe(keyframe, pose, along_m, int(segment[frame])))
+
+
+def keep_map(mapped: MapFile, path: Path) -> None:
+    """Write the map of finished drives, but for occupancy, which is made of rays again."""
+    blocks, starts, cells = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint16)
+    nothing = OccupancyPart(clamped.CellRows(blocks, starts, cells, np.zeros((0, 3), np.float32)))
+    with MapFile.create(path) as kept:
+        for session in mapped.sessions:
+            start = {name: kept_ for name, kept_ in session.info.start.items() if name == IMAGES}
+            new = kept.begin(replace(session.info, start=start))
+            for number, T_world_camera in enumerate(session.odometry.T_world_camera):
+                time_s = float(session.odometry.timestamps_s[number])
+                new.add_frame(T_world_camera, time_s, session.health[number])
+            for submap in session.submaps:
+                new.submaps.add(replace(submap, occupancy=nothing), compress=True)
+        for kind in (AXES, RIG, LOOPS, KEYFRAME, RAYS):
+            mapped.store.copy(kind, kept.store)
+        kept.commit()
 
 
 def read_all(map_: MapFile) -> None:
@@ -111,32 +158,6 @@ def check_session(session: Session, settings: DriveSettings) -> None:
     check_rays(session, settings)
 
 
-def _renumbered(keys: list[Key], numbers: dict[int, int]) -> dict[Key, Key]:
-    """Return the keys of some drives, and what they become with new numbers of drives."""
-    found: dict[Key, Key] = {}
-    for key in keys:
-        session, *rest = key if isinstance(key, tuple) else (key,)
-        if session in numbers:
-            found[key] = (numbers[session], *rest) if rest else numbers[session]
-    return found
-
-
-def _refuse_again(session: Session, target: MapFile) -> None:
-    """Refuse a drive that a map has already: it would be evidence of its own."""
-    path = session.odometry
-    for other in target.sessions:
-        known = other.odometry
-        if np.array_equal(known.T_world_camera, path.T_world_camera) and np.array_equal(
-            known.timestamps_s, path.timestamps_s
-        ):
-            raise FormatError(
-                "the map has this drive already",
-                where=session.where,
-                got=f"{session.info.source}, {counted(len(session), 'frame')}",
-                expected="another drive",
-            )
-
-
 def _append_frames(session: Session, part: Session, lead: int) -> Float64:
     """Add the frames behind the lead of a part to a drive; returns ``T_world_part`` (4, 4)."""
     path, health, T_world_part = part.odometry, part.health, np.eye(4)
@@ -151,16 +172,3 @@ def _append_frames(session: Session, part: Session, lead: int) -> Float64:
         T = orthonormalise(T_world_part @ T_part_camera) if lead else T_part_camera
         session.add_frame(T, float(path.timestamps_s[frame]), health[frame])
     return T_world_part
-
-
-def _append_submaps(
-    session: Session, part: Session, lead: int, T_world_part: Float64, voxel_m: float
-) -> None:
-    """Add what a part fused; occupancy is made from its rays, as where they lie is known now."""
-    for one in part.submaps:
-        frames = one.frames - max(0, lead - one.first_frame)
-        if frames > 0:
-            fused = one.fused.moved(T_world_part, voxel_m).rounded() if lead else one.fused
-            nothing = one.occupancy.select(np.zeros(len(one.occupancy.rows.blocks), np.bool_))
-            number, first = len(session.submaps), session.submaps.frames
-            session.submaps.add(Submap(number, first, frames, fused, nothing))

@@ -38,7 +38,6 @@ class Georeference:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square of the distances."""
         return float(np.sqrt(np.mean(self.misfit_m**2)))
 
     @property
@@ -47,7 +46,6 @@ class Georeference:
         return float(np.degrees(np.arccos(min(1.0, self.T_survey_map[2, 2]))))
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures of ``summary.json``."""
         return {
             "positions": len(self.misfit_m),
             "positions_left_out": self.left_out,

@@ -52,7 +52,14 @@ def join_sessions(map_: MapFile, links: Sequence[Link]) -> None:
     paths, believed = _held_together(map_, links)
     for session in map_.sessions:
         if session.number in paths:
-            _place(map_, session, paths[session.number])
+            path, loops = paths[session.number].T_world_camera, {**NO_LOOPS, **session.loops}
+            T_world_session = path[0] @ invert(session.odometry.T_world_camera[0])
+            before = loops.get(POSES_BEFORE_LINKS, loops[OPTIMISED_POSES])
+            optimised = invert(T_world_session) @ path
+            session.set_loops({**loops, POSES_BEFORE_LINKS: before, OPTIMISED_POSES: optimised})
+            if session is not map_.sessions[0]:
+                T_map_session = map_.sessions[0].T_map_world @ T_world_session
+                session.set_axes(T_map_session, session.camera)
         elif POSES_BEFORE_LINKS in session.loops:
             session.set_loops({**session.loops, OPTIMISED_POSES: session.loops[POSES_BEFORE_LINKS]})
     kept, linked = set(map(id, believed)), paths or [map_.sessions[0].number]
@@ -117,10 +124,7 @@ def seen_before(map_: MapFile, session: Session) -> frozenset[int]:
 
 
 def path_up_to(session: Session) -> Float64:
-    """Return float64 (N,), path of a drive up to each frame; lost frames count several times.
-
-    Of known poses it is 0 everywhere: odometry, whose drift grows with the path, had no part in it.
-    """
+    """Return float64 (N,), path up to each frame; lost frames count more, known poses 0."""
     return DrivePath.of(session.odometry, session.health, session.scale).path_m
 
 
@@ -142,9 +146,9 @@ def doubts_of_lengths(map_: MapFile) -> list[str]:
 def times_as_long(
     one: Trajectory, other: Trajectory, links: Sequence[Loop]
 ) -> tuple[float, float] | None:
-    """Return how many times as long one drive is as another, and the standard deviation of that.
+    """Return how many times as long one path is as another, and its standard deviation.
 
-    The paths are those by odometry. None where there are too few links, or all are at one place.
+    None where there are too few links, or all are at one place.
     """
     if len(links) < _FEWEST:
         return None
@@ -209,10 +213,7 @@ def _confirmed(loops: Sequence[Loop], views: MapViews, new: Session) -> list[Lin
 def _held_together(
     map_: MapFile, links: Sequence[Link]
 ) -> tuple[dict[int, Trajectory], Sequence[Link]]:
-    """Solve the graph until all of its drives are held by links that it believes.
-
-    Returns the path of each in the world of the first, by its number, and these links.
-    """
+    """Solve the graph until believed links hold all its drives; return paths and these."""
     while True:
         places = _reached(map_, links)
         inside = [link for link in links if set(link.sessions) <= set(places)]
@@ -231,10 +232,7 @@ def _held_together(
 
 
 def _reached(map_: MapFile, links: Sequence[Link]) -> dict[int, Float64]:
-    """Return about where the drives are that links or measured positions connect with the first.
-
-    By number, ``T_world_session`` (4, 4), in the world of the first.
-    """
+    """Return ``T_world_session``, about, of drives that links or positions connect."""
     found = {map_.sessions[0].number: np.eye(4)}
     surest = sorted(links, key=lambda link: -link.loop.inliers)
     while True:
@@ -286,9 +284,9 @@ def _solve(
         for one, T in zip(sessions, places.values(), strict=True)
     ]
     loops = [
-        Constraint((place, place), Loop(**loop))
+        Constraint((place, place), loop)
         for place, session in enumerate(sessions)
-        for loop in session.loops.get("closed", ())
+        for loop in session.closed
     ]
     constraints = [
         Constraint((numbers.index(link.sessions[0]), numbers.index(link.sessions[1])), link.loop)
@@ -315,15 +313,3 @@ def _held(map_: MapFile, sessions: Sequence[Session], drives: Sequence[DrivePath
     # Numbers of millions of metres would cost the optimiser digits.
     near = [replace(each, position_m=each.position_m - centre_m) for each in fixes]
     return Held(invert(T_map_world) @ T_map_survey, near)
-
-
-def _place(map_: MapFile, session: Session, path: Trajectory) -> None:
-    """Write where a drive is: its axes, and how its path is optimised."""
-    T_world_session = path.T_world_camera[0] @ invert(session.odometry.T_world_camera[0])
-    optimised = invert(T_world_session) @ path.T_world_camera
-    loops = {**NO_LOOPS, **session.loops}
-    before = loops.get(POSES_BEFORE_LINKS, loops[OPTIMISED_POSES])
-    session.set_loops({**loops, POSES_BEFORE_LINKS: before, OPTIMISED_POSES: optimised})
-    first = map_.sessions[0]
-    if session is not first:
-        session.set_axes(first.T_map_world @ T_world_session, session.camera)

@@ -7,7 +7,7 @@ comes of it is what one process makes: parts are numbered by submap, and joined 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,21 +17,20 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import MappingError
+from recon.core.errors import FormatError, MappingError, SettingsError
 from recon.core.geometry.se3 import apply
 from recon.core.values import RayCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import side_by_side
 from recon.io.files import resolved
+from recon.map.builders import OccupancyBuilder, Submap
 from recon.map.cut import Cutter, TileKey, TileParts
 from recon.map.occupancy.bodies import FrameObservations
 from recon.map.sessions.joining import seen_before
 from recon.map.settings import DriveSettings
-from recon.map.store.finished import CastSubmaps, check_rays
 from recon.map.store.map_file import MapFile
 from recon.map.store.records import Store
 from recon.map.store.session import Session, Submaps
-from recon.map.submaps import Submap
 from recon.map.tiles import Tiles
 
 Each = Callable[[Callable[[Any], None], Sequence[Any]], None]
@@ -63,14 +62,20 @@ def place_map(map_: MapFile, settings: DriveSettings, threads: int = 1) -> Place
     from its rays, of so many submaps at a time. A map without rays has a cloud, and no occupancy.
     """
     placed = PlacedSubmaps(map_, settings)
+    submaps: Iterable[Submap] = placed
+    if not placed.ready:
+        # They may be cut several times, and are slow to make: once, into a temporary store.
+        submaps = made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
+        for submap in side_by_side(placed.__getitem__, range(len(placed)), threads=threads):
+            made.add(replace(submap, index=len(made), first_frame=made.frames))
     tiles = Tiles.of_submaps(
-        placed if placed.ready else _made_once(placed, settings, threads),
+        submaps,
         settings,
         map_.first.T_map_world,
         placed.corrections,
         drives=placed.drives,
     )
-    return _with_path(map_, tiles.with_observations(_observations(map_, settings)))
+    return _with_path(map_, settings, tiles)
 
 
 def place_map_on(
@@ -98,7 +103,7 @@ def place_map_on(
     files = [folder / f"tiles-{n}" for n in range(len(groups))]
     each(partial(_make_tiles, file, settings, taken), [*zip(groups, files, strict=True)])
     tiles.adopt(files)
-    return _with_path(map_, tiles.with_observations(_observations(map_, settings)))
+    return _with_path(map_, settings, tiles)
 
 
 class PlacedSubmaps:
@@ -132,7 +137,6 @@ class PlacedSubmaps:
         return sum(self.drives)
 
     def __iter__(self) -> Iterator[Submap]:
-        """Return the submaps in order, read one at a time."""
         return map(self.__getitem__, range(len(self)))
 
     def __getitem__(self, number: int) -> Submap:
@@ -158,22 +162,11 @@ def has_occupancy(map_: MapFile) -> bool:
 
 
 def _to_be_cast(session: Session, settings: DriveSettings) -> bool:
-    """Return whether the occupancy of the only drive of a map is made from its rays.
-
-    One that is being mapped has that of its own settings; a finished one kept rays alone, if any.
-    """
+    """Return whether an only drive's occupancy was not kept, or made with other settings."""
     if not any(entry.cells for entry in session.submaps.entries):
         return session.ray_frames > 0
     made, wanted = settings_of(session).occupancy, settings.occupancy
     return made.model_copy(update={"keep_rays": wanted.keep_rays}) != wanted
-
-
-def _made_once(placed: PlacedSubmaps, settings: DriveSettings, threads: int) -> Submaps:
-    """Return submaps that may be cut several times, and are slow to make, in a temporary store."""
-    made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
-    for submap in side_by_side(placed.__getitem__, range(len(placed)), threads=threads):
-        made.add(replace(submap, index=len(made), first_frame=made.frames))
-    return made
 
 
 def _beside(
@@ -219,21 +212,17 @@ def _without_place(map_: MapFile, session: Session) -> frozenset[int]:
     return frozenset(frames.tolist())
 
 
-def _with_path(map_: MapFile, tiles: Tiles) -> PlacedMap:
-    """Return the tiles of a map with the paths of its linked drives."""
-    sessions = map_.linked
-    paths = [apply(s.T_map_world, s.trajectory.positions_m) for s in sessions]
-    placed = map_.placed
-    good = [placed[session.number] for session in sessions]
-    return PlacedMap(tiles, _with_gaps(paths, np.nan), _with_gaps(good, False))
-
-
-def _with_gaps(parts: Sequence[np.ndarray], gap: float) -> np.ndarray:
-    """Return rows of several drives, with a row in between."""
-    rows = [parts[0]]
-    for part in parts[1:]:
-        rows += [np.full_like(part[:1], gap), part]
-    return np.concatenate(rows)
+def _with_path(map_: MapFile, settings: DriveSettings, tiles: Tiles) -> PlacedMap:
+    """Return the tiles of a map with what its frames saw, and the paths of its linked drives."""
+    tiles.observations = _observations(map_, settings)
+    paths, good, placed = list[Float64](), list[Bool](), map_.placed
+    for session in map_.linked:
+        if paths:  # a row between two drives
+            paths.append(np.full((1, 3), np.nan))
+            good.append(np.zeros(1, np.bool_))
+        paths.append(apply(session.T_map_world, session.trajectory.positions_m))
+        good.append(placed[session.number])
+    return PlacedMap(tiles, np.concatenate(paths), np.concatenate(good))
 
 
 def _batches(items: Sequence[Any], workers: int) -> list[Any]:
@@ -272,8 +261,74 @@ def _make_tiles(
     keys, file = task
     tiles = taken(path=file)
     with closing(MapFile.open(map_file)) as map_:
-        tiles.with_observations(_observations(map_, settings))
+        tiles.observations = _observations(map_, settings)
         for key in keys:
             tiles.make_voxels(key)
             tiles.cloud(key)
     tiles.save()
+
+
+@dataclass(frozen=True, eq=False)
+class CastSubmaps:
+    """The submaps of a drive, each with occupancy made from its rays when it is read.
+
+    ``T_map_world`` is from world to the axes of the occupancy (None = its own); ``T_world_camera``,
+    float64 (N, 4, 4), from where rays are cast (None = the path by odometry); rays of the frames
+    ``without`` are not cast.
+    """
+
+    session: Session
+    settings: DriveSettings
+    T_map_world: Float64 | None = None
+    T_world_camera: Float64 | None = None
+    without: Collection[int] = ()
+
+    def __post_init__(self) -> None:
+        if self.session.submaps.frames != len(self.session):
+            raise FormatError("the map lacks submaps", where=self.session.where)
+
+    def __len__(self) -> int:
+        return len(self.session.submaps)
+
+    def __getitem__(self, number: int) -> Submap:
+        session, kept = self.session, self.session.submaps[number]
+        T_map_world = session.T_map_world if self.T_map_world is None else self.T_map_world
+        poses = self.T_world_camera
+        poses = session.odometry.T_world_camera if poses is None else poses
+        builder = OccupancyBuilder(self.settings.occupancy, T_map_world)
+        for frame in range(kept.first_frame, kept.first_frame + kept.frames):
+            if frame not in self.without:
+                builder.integrate(session.rays(frame)[0].cloud(), poses[frame])
+        return replace(kept, occupancy=builder.take())
+
+
+def check_rays(session: Session, settings: DriveSettings) -> None:
+    """Refuse a cell size or range that the kept rays of a session do not support."""
+    if not session.ray_frames:
+        raise FormatError(
+            "the run kept no rays to build occupancy from",
+            where=session.where,
+            hint="map the drive again with --set occupancy.keep_rays=true",
+        )
+    if session.ray_frames != len(session):
+        raise FormatError(
+            "the run has different numbers of ray frames and poses",
+            where=session.where,
+            got=f"{session.ray_frames} and {len(session)}",
+        )
+    grain, wanted = session.rays(0)[1], settings.occupancy
+    # The 0.05 % tolerance is for rounded input, such as 0.3333 for a third.
+    if wanted.resolution_m < grain.cell_m * 0.9995:
+        raise SettingsError(
+            "the rays kept by the run are too coarse for these voxels",
+            got=f"{wanted.resolution_m:g} m",
+            expected=f"at least {grain.cell_m:g} m",
+            hint="map the drive again with a smaller --set occupancy.resolution_m=",
+        )
+    if wanted.max_range_m > grain.max_range_m * (1 + 1e-9):
+        raise SettingsError(
+            "the rays kept by the run do not reach that far",
+            got=f"{wanted.max_range_m:g} m",
+            expected=f"at most {grain.max_range_m:g} m",
+            hint="map the drive again with --set occupancy.max_range_m=",
+        )

@@ -5,9 +5,6 @@ From the map down to the file:
 - `map_file.py`: drives in one file, and which of their frames have a place in it;
 - `session.py`: what one drive keeps: path, health, axes, submaps, keyframes, rays, loops;
 - `trees.py`: values as records of their kind, and records as JSON and bytes;
-- `records.py`: trees of arrays under a kind and a key, with a cache of the last ones read; its
-  commits, and what a full disk means;
-- `database.py`: the SQLite file: how it is opened and recognised.
-
-`finished.py`: what a finished map keeps, and occupancy made from its rays again.
+- `records.py`: trees of arrays under a kind and a key, in an SQLite file: how it is opened and
+  recognised, a cache of the last ones read, commits, and what a full disk means.
 """

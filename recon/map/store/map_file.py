@@ -197,7 +197,6 @@ class MapFile:
         self.store.put(LINKS, 0, content, compress=True)
 
     def begin(self, info: SessionInfo) -> Session:
-        """Add a drive."""
         number = max((session.number for session in self.sessions), default=-1) + 1
         self.sessions.append(Session.begin(self.store, number, info))
         return self.sessions[-1]

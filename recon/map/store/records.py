@@ -1,4 +1,4 @@
-"""Records of a map in one file: trees of arrays and plain values, committed whole or not at all."""
+"""Records of a map in one SQLite file: trees of arrays, committed whole or not at all."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
+from io import BytesIO
 from pathlib import Path
 from threading import Lock, RLock
 from typing import Any, Final, TypeVar
@@ -20,25 +21,22 @@ from typing_extensions import Self
 from recon.core.errors import FormatError, OutputError
 from recon.io.atomic import check_targets
 from recon.io.files import reading, refuse_special
-from recon.map.store.database import (
-    Content,
-    begin_to_read,
-    begin_to_write,
-    check_format,
-    closed_on_error,
-    connect,
-    format_of,
-    make_tables,
-)
 from recon.map.store.trees import Bytes, from_bytes, to_bytes
 
 Key = int | tuple[int, ...]
 CACHE_BYTES: Final = 100_000_000
+FORMAT: Final = 2
+"""Number of the format, which grows with every change that older versions cannot read."""
+_OURS: Final = 0x7265636E  # "recn"
+_TABLE: Final = """CREATE TABLE record (
+    kind TEXT NOT NULL, key TEXT NOT NULL, tree TEXT NOT NULL, checksum INTEGER NOT NULL,
+    content BLOB NOT NULL, PRIMARY KEY (kind, key)
+)"""
+_PAGE_BYTES: Final = 1 << 14
+_PIECE_BYTES: Final = 1 << 18
 _SMALL_BYTES: Final = 1 << 24
 _MOST_GROWTH: Final = 16
 """What was measured becomes two to three times smaller; small records may shrink further."""
-
-
 _ROOM: Final = "check that the folder is writable and the disk is not full"
 
 
@@ -71,6 +69,98 @@ def _files_of(path: Path) -> list[Path]:
     return [path.with_name(path.name + end) for end in ("", "-wal", "-shm", "-journal")]
 
 
+def connect(path: Path | None, *, read_only: bool = False) -> sqlite3.Connection:
+    """Return a connection without transactions of its own; the lock of the store guards it."""
+    name: str | Path = "" if path is None else path
+    if path is not None and read_only:
+        name = f"{path.absolute().as_uri()}?mode=ro"
+    return sqlite3.connect(
+        name, timeout=0, isolation_level=None, check_same_thread=False, uri=read_only
+    )
+
+
+@contextmanager
+def _closed_on_error(database: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
+    """Close a connection where the block that sets it up fails."""
+    try:
+        yield database
+    except BaseException:
+        database.close()
+        raise
+
+
+def _make_tables(database: sqlite3.Connection) -> None:
+    # Most records are larger than any page: fewer pages are written faster.
+    database.execute(f"PRAGMA page_size = {_PAGE_BYTES}")
+    database.execute("BEGIN")
+    database.execute(f"PRAGMA application_id = {_OURS}")
+    database.execute(f"PRAGMA user_version = {FORMAT}")
+    database.execute(_TABLE)
+    database.execute("COMMIT")
+
+
+def _begin_to_write(database: sqlite3.Connection) -> None:
+    """Begin a transaction that keeps other writers out."""
+    # Readers go on at the last commit while the next one is written.
+    database.execute("PRAGMA journal_mode = WAL")
+    database.execute("PRAGMA synchronous = FULL")
+    database.execute("BEGIN IMMEDIATE")
+
+
+def check_format(database: sqlite3.Connection, path: Path) -> None:
+    """Refuse files of other programs, of newer versions, and with tables of another make."""
+    try:
+        (ours,) = database.execute("PRAGMA application_id").fetchone()
+        (number,) = database.execute("PRAGMA user_version").fetchone()
+        tables = {sql for (sql,) in database.execute("SELECT sql FROM sqlite_master") if sql}
+    except sqlite3.DatabaseError as error:
+        if "lock" in str(error):
+            raise FormatError("another program is opening the map", where=path) from error
+        raise FormatError("not a map of recon, or damaged", where=path, got=str(error)) from error
+    if ours == _OURS and number > FORMAT:
+        raise FormatError(
+            "the map was written by a newer version of recon",
+            where=path,
+            got=f"format {number}",
+            expected=f"at most {FORMAT}",
+            hint="update recon",
+        )
+    if ours != _OURS or tables != {_TABLE}:
+        raise FormatError("not a map of recon", where=path)
+
+
+class _Content:
+    """The bytes of a record, read piece by piece, with ``checksum`` so far and bytes ``left``.
+
+    Read as one value, they would exist three times: in the database, as bytes, and as arrays.
+    """
+
+    def __init__(self, database: sqlite3.Connection, row: int, size: int, checksum: int) -> None:
+        self.checksum, self.left = checksum, size
+        if sys.version_info >= (3, 11):
+            self._file = database.blobopen("record", "content", row, readonly=True)
+        else:
+            query = "SELECT content FROM record WHERE rowid = ?"
+            self._file = BytesIO(database.execute(query, (row,)).fetchone()[0])
+
+    def read(self, size: int) -> bytearray:
+        if not 0 <= size <= self.left:
+            raise FormatError("a record of the map is truncated")
+        self.left -= size
+        found = bytearray(size)
+        for begin in range(0, size, _PIECE_BYTES):
+            piece = self._file.read(min(_PIECE_BYTES, size - begin))
+            found[begin : begin + len(piece)] = piece
+            self.checksum = zlib.crc32(piece, self.checksum)
+        return found
+
+    def close(self) -> None:
+        """Read the rest, so that the checksum is that of all bytes."""
+        while self.left:
+            self.read(min(_PIECE_BYTES, self.left))
+        self._file.close()
+
+
 class Store:
     """Records under a kind and a key, in one SQLite file.
 
@@ -96,36 +186,36 @@ class Store:
             for file in _files_of(path):
                 file.unlink(missing_ok=True)
             path.parent.mkdir(parents=True, exist_ok=True)
-            with closed_on_error(connect(path)) as database:
-                make_tables(database)
-                begin_to_write(database)
+            with _closed_on_error(connect(path)) as database:
+                _make_tables(database)
+                _begin_to_write(database)
         return cls(database, path, cache_bytes)
 
     @classmethod
     def open(cls, path: Path, *, read_only: bool = False, cache_bytes: int = CACHE_BYTES) -> Self:
-        """Open a store at its last commit."""
         with reading(path):
             with path.open("rb"):  # a missing file, a folder, no permission
                 pass
             for file in _files_of(path):
                 refuse_special(file)
             database = connect(path, read_only=read_only)
-        with closed_on_error(database):
+        with _closed_on_error(database):
             with reading(path):
                 check_format(database, path)
-                if read_only:
-                    begin_to_read(database)
+                if read_only:  # what was committed last, whatever is committed later
+                    database.execute("BEGIN")
+                    database.execute("SELECT count(*) FROM record LIMIT 1")
             if not read_only:
                 with writing(path):
-                    begin_to_write(database)
+                    _begin_to_write(database)
         return cls(database, path, cache_bytes)
 
     @classmethod
     def temporary(cls, *, cache_bytes: int = CACHE_BYTES) -> Self:
         """Begin a store in a temporary file, which is gone when the store is closed."""
-        with writing(None), closed_on_error(connect(None)) as database:
+        with writing(None), _closed_on_error(connect(None)) as database:
             database.execute("PRAGMA journal_mode = OFF")
-            make_tables(database)
+            _make_tables(database)
             database.execute("BEGIN")
         return cls(database, None, cache_bytes)
 
@@ -143,10 +233,7 @@ class Store:
         self._insert(kind, _name(key), text, content)
 
     def get(self, kind: str, key: Key) -> dict[str, Any]:
-        """Return a record, which others may hold as well: copy it before changing it.
-
-        It has no large compressed arrays: see `read`.
-        """
+        """Return a record, not to be changed, without large compressed arrays: see `read`."""
         return self.cache.get((kind, key), lambda: self.read(kind, key))
 
     def read(self, kind: str, key: Key, *, most_bytes: int = 0) -> dict[str, Any]:
@@ -168,12 +255,6 @@ class Store:
                 content.close()
                 if content.checksum != checksum:
                     raise FormatError("a record of the map is damaged", got=f"{kind} {name}")
-
-    def need_format(self, number: int) -> None:
-        """Let no version open the store that reads older formats alone."""
-        with self._lock, writing(self.path):
-            if number > format_of(self._database):
-                self._database.execute(f"PRAGMA user_version = {number}")
 
     def delete(self, kind: str, key: Key | None = None) -> None:
         """Delete a record, or all of a kind; it need not exist."""
@@ -216,13 +297,7 @@ class Store:
         return found is not None and bool(found[0])
 
     def copy(self, kind: str, other: Store, keys: Mapping[Key, Key] | None = None) -> None:
-        """Copy records of a kind to another store without unpacking them.
-
-        ``keys`` are those to copy, with their keys in the other store; None = all, under their own.
-        """
-        with self._lock, reading(self.name):
-            number = format_of(self._database)
-        other.need_format(number)
+        """Copy records, packed, to another store; ``keys`` (None = all) with their keys there."""
         for key, new in ({k: k for k in self.keys(kind)} if keys is None else keys).items():
             with self._lock, reading(self.name):
                 text, content, checksum = self._row(kind, _name(key))
@@ -256,40 +331,32 @@ class Store:
         self.close()
 
     def _insert(self, kind: str, name: str, text: str, content: Sequence[Bytes]) -> None:
-        checksum = _checksum(kind, name, text, *content)
+        head = (kind, name, text, _checksum(kind, name, text, *content))
+        insert = "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, {})"
         with self._lock, writing(self.path):
-            _write_record(self._database, (kind, name, text, checksum), content)
+            if sys.version_info >= (3, 11):
+                # Bound to a statement, bytes are copied twice, which for a submap is more memory
+                # than the submap itself: room is made for them, and written piece by piece.
+                size = sum(map(len, content))
+                values = (*head, size)
+                row = self._database.execute(insert.format("zeroblob(?)"), values).lastrowid
+                if size:
+                    with self._database.blobopen("record", "content", row) as blob:
+                        for piece in content:
+                            blob.write(piece)
+            else:
+                self._database.execute(insert.format("?"), (*head, b"".join(content)))
             self.cache.drop((kind, _key(name)))
 
-    def _row(self, kind: str, name: str) -> tuple[str, Content, int]:
+    def _row(self, kind: str, name: str) -> tuple[str, _Content, int]:
         query = "SELECT rowid, length(content), tree, checksum FROM record"
         query += " WHERE kind = ? AND key = ?"
         found = self._database.execute(query, (kind, name)).fetchone()
         if found is None:
             raise FormatError("the map lacks a record", got=f"{kind} {name}")
         row, size, text, checksum = found
-        content = Content(self._database, row, size, _checksum(kind, name, text))
+        content = _Content(self._database, row, size, _checksum(kind, name, text))
         return text, content, checksum
-
-
-def _write_record(
-    database: sqlite3.Connection, head: tuple[str, str, str, int], content: Sequence[Bytes]
-) -> None:
-    """Insert a record (kind, key, tree, checksum), in place of one of the same kind and key.
-
-    Bound to a statement, bytes are copied twice, which for a submap is more memory than the submap
-    itself; so room is made for them, and they are written into it piece by piece.
-    """
-    insert = "INSERT OR REPLACE INTO record VALUES (?, ?, ?, ?, {})"
-    if sys.version_info >= (3, 11):
-        size = sum(map(len, content))
-        row = database.execute(insert.format("zeroblob(?)"), (*head, size)).lastrowid
-        if size:
-            with database.blobopen("record", "content", row) as blob:
-                for piece in content:
-                    blob.write(piece)
-    else:
-        database.execute(insert.format("?"), (*head, b"".join(content)))
 
 
 def _name(key: Key) -> str:
@@ -326,7 +393,6 @@ class Cache:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that the kept values take."""
         return self._size
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:

@@ -15,8 +15,8 @@ from recon.core.values import RayCloud, RayGrain, RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64, array_in, tree_of
 from recon.io.files import reading
 from recon.look.rig import KnownRig, RefinedRig
+from recon.map.builders import Submap
 from recon.map.fusion import KNOWABLE, row_bytes
-from recon.map.store.database import MORE_ATTRIBUTES
 from recon.map.store.records import Store
 from recon.map.store.trees import (
     FRAMES,
@@ -33,13 +33,13 @@ from recon.map.store.trees import (
     rig_record,
     value_in,
 )
-from recon.map.submaps import Submap
 from recon.odometry.health import trusted_poses
 from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure
 from recon.places.detector import StoredKeyframe
 from recon.places.fixes import NO_FIXES, Fixes
 from recon.places.keyframe import Keyframe
+from recon.places.loop import Loop
 
 SESSION: Final = "session"
 AXES: Final = "axes"
@@ -70,10 +70,7 @@ class SessionInfo:
 
 
 class Session:
-    """One drive in a map: its number, ``info``, ``submaps`` and ``keyframes``.
-
-    The next commit of the map keeps what is added.
-    """
+    """One drive in a map; the next commit of the map keeps what is added."""
 
     def __init__(self, store: Store, number: int) -> None:
         self._store = store
@@ -81,11 +78,23 @@ class Session:
         self._poses: list[Float64] = []
         self._times_s: list[float] = []
         self._health: list[OdometryHealth] = []
-        self._flushed = 0
         with reading(store.name):
             self.info = value_in(SessionInfo, store.read(SESSION, number))
-            self._read_frames()
-            self._check_loops()
+            for first in store.numbers(FRAMES, number):
+                if first != len(self):
+                    got = f"{len(self)} to {first}"
+                    raise FormatError("frames of the drive are missing", got=got)
+                for T, time_s, health in frames_in(store.read(FRAMES, (number, first))):
+                    self.add_frame(T, time_s, health)
+            self._flushed = len(self)
+            if sorted(self._times_s) != self._times_s:
+                raise FormatError("frames of the drive are not in order")
+            for name in (OPTIMISED_POSES, POSES_BEFORE_LINKS):
+                if (poses := self.loops.get(name)) is not None:
+                    path_of(poses, np.array(self._times_s))
+            for loop in self.closed:
+                if not 0 <= loop.first < loop.last < len(self):
+                    raise FormatError("a loop of the map is not between two frames", got=f"{loop}")
         self.submaps = Submaps(store, number)
         if self.submaps.frames > len(self):
             raise FormatError("the map has submaps of frames without a pose", where=store.name)
@@ -157,6 +166,11 @@ class Session:
         if not self._store.has(LOOPS, self.number):
             return {}
         return self._store.get(LOOPS, self.number)
+
+    @property
+    def closed(self) -> tuple[Loop, ...]:
+        """The loops that were closed."""
+        return tuple(map(loop_in, self.loops.get("closed", ())))
 
     def corrections(self) -> Float64 | None:
         """Return float64 (S, 4, 4), by what loops move each submap; None = nothing moves."""
@@ -245,25 +259,6 @@ class Session:
         content = frames_record(self._poses[first:], self._times_s[first:], self._health[first:])
         self._store.put(FRAMES, (self.number, first), content, compress=True)
 
-    def _read_frames(self) -> None:
-        for first in self._store.numbers(FRAMES, self.number):
-            if first != len(self):
-                raise FormatError("frames of the drive are missing", got=f"{len(self)} to {first}")
-            for T, time_s, health in frames_in(self._store.read(FRAMES, (self.number, first))):
-                self.add_frame(T, time_s, health)
-        self._flushed = len(self)
-        if sorted(self._times_s) != self._times_s:
-            raise FormatError("frames of the drive are not in order")
-
-    def _check_loops(self) -> None:
-        for name in (OPTIMISED_POSES, POSES_BEFORE_LINKS):
-            if (poses := self.loops.get(name)) is not None:
-                path_of(poses, np.array(self._times_s))
-        for tree in self.loops.get("closed", ()):
-            loop = loop_in(tree)
-            if not 0 <= loop.first < loop.last < len(self):
-                raise FormatError("a loop of the map is not between two frames", got=f"{loop}")
-
 
 SUBMAP: Final = "submap"
 ENTRY: Final = "submap_entry"
@@ -279,7 +274,7 @@ class SubmapEntry:
     frames: int
     voxels: int
     cells: int
-    more: tuple[str, ...] = ()  # attributes of its points that format 1 does not have
+    more: tuple[str, ...] = ()  # attributes of its points beside `KNOWABLE`
 
     @property
     def nbytes(self) -> int:
@@ -317,8 +312,6 @@ class Submaps:
     def add(self, submap: Submap, *, compress: bool = False) -> None:
         entry = _entry_of(submap)
         key = (self._session, submap.index)
-        if entry.more:
-            self.store.need_format(MORE_ATTRIBUTES)
         self.store.put(SUBMAP, key, tree_of(submap), compress=compress)
         content = asdict(entry).items()
         self.store.put(ENTRY, key, {name: value for name, value in content if value != ()})

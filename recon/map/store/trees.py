@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
-from typing import Any, Final, NamedTuple, TypeVar, get_origin, get_type_hints
+from typing import Any, Final, TypeVar, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ from recon.core.values import (
     Trajectory,
     check_size,
 )
-from recon.core.values.arrays import Float64, UInt8, array_in, frozen_array
+from recon.core.values.arrays import Float64, array_in, frozen_array
 from recon.look.fault import active
 from recon.look.fit import FittedFault
 from recon.look.rig import KnownRig
@@ -92,36 +92,26 @@ def from_bytes(text: str, read: Callable[[int], bytearray], most: int) -> dict[s
         if not isinstance(value, dict):
             return value
         if _ARRAY in value:
-            *head, begin, end = value[_ARRAY]
+            name, shape, layout, codec, begin, end = value[_ARRAY]
             if begin != position:
                 raise FormatError("the arrays of a record of the map are not in order")
             position = end
-            claim = _Claim(np.dtype(head[0]), *head[1:])
-            left -= claim.nbytes if claim.codec == _ZLIB else 0
+            dtype = np.dtype(name)
+            if dtype.kind not in _KINDS or min(shape, default=0) < 0:
+                raise FormatError("an array of the map has an impossible type or shape")
+            left -= math.prod(shape) * dtype.itemsize if codec == _ZLIB else 0
             if left < 0:
                 raise FormatError("a record of the map claims more than it can hold")
-            return _unpack(claim, read(end - begin))
+            array = _unpack(
+                read(end - begin), dtype, shape[::-1] if layout == "F" else shape, codec
+            )
+            return array.T if layout == "F" else array
         return {name: restored(item) for name, item in value[_TREE].items()}
 
     tree = restored(json.loads(text))
     if not isinstance(tree, dict):
         raise FormatError("a record of the map is no tree")
     return tree
-
-
-class _Claim(NamedTuple):
-    """What a record says of an array, before anything is made of it."""
-
-    dtype: np.dtype[Any]
-    shape: list[int]
-    layout: str
-    codec: str
-
-    @property
-    def nbytes(self) -> int:
-        if self.dtype.kind not in _KINDS or min(self.shape, default=0) < 0:
-            raise FormatError("an array of the map has an impossible type or shape")
-        return math.prod(self.shape) * self.dtype.itemsize
 
 
 def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | memoryview]:
@@ -136,39 +126,31 @@ def _pack(array: NDArray[Any], *, compress: bool) -> tuple[list[Any], bytes | me
     if compress and array.size:
         # Runs and single bytes: as small as with a search for repeats, in half the time.
         packer = zlib.compressobj(1, zlib.DEFLATED, zlib.MAX_WBITS, 9, zlib.Z_RLE)
-        packed = packer.compress(_planes(flat).tobytes()) + packer.flush()
+        columns = flat.reshape(-1, _columns(flat.shape))
+        planes = columns.view(np.uint8).reshape(*columns.shape, flat.dtype.itemsize)
+        packed = packer.compress(planes.transpose(1, 2, 0).tobytes()) + packer.flush()
         if len(packed) < len(content):
             content, codec = packed, _ZLIB
     return [little.dtype.str, list(array.shape), layout, codec], content
 
 
-def _unpack(claim: _Claim, packed: bytearray) -> NDArray[Any]:
+def _unpack(packed: bytearray, dtype: np.dtype[Any], shape: list[int], codec: str) -> NDArray[Any]:
     """Return the array of these bytes, which it takes over where they are not compressed."""
-    dtype, shape, layout, codec = claim
-    axes = shape[::-1] if layout == "F" else shape
+    nbytes = math.prod(shape) * dtype.itemsize
     content: bytes | bytearray = packed  # compiled kernels take only arrays that can be written
     if codec == _ZLIB:
-        content = zlib.decompressobj().decompress(packed, claim.nbytes + 1)
-    if len(content) != claim.nbytes:
+        content = zlib.decompressobj().decompress(packed, nbytes + 1)
+    if len(content) != nbytes:
         raise FormatError("an array of the map is truncated")
     numbers: NDArray[Any] = np.frombuffer(content, np.uint8)
     if codec == _ZLIB:
-        planes = numbers.reshape(_columns(axes), dtype.itemsize, -1).transpose(2, 0, 1)
+        planes = numbers.reshape(_columns(shape), dtype.itemsize, -1).transpose(2, 0, 1)
         numbers = np.array(planes, order="C").reshape(-1)
-    array: NDArray[Any] = numbers.view(dtype).reshape(axes)
-    return array.T if layout == "F" else array
+    return numbers.view(dtype).reshape(shape)
 
 
 def _columns(shape: Sequence[int]) -> int:
     return shape[1] if len(shape) == 2 and 0 < shape[1] <= _NARROW else 1
-
-
-def _planes(array: NDArray[Any]) -> UInt8:
-    """Return uint8 (columns, bytes of a number, N)."""
-    size = array.dtype.itemsize
-    columns = array.reshape(-1, _columns(array.shape))
-    split = columns.view(np.uint8).reshape(-1, columns.shape[1], size)
-    return np.asarray(split.transpose(1, 2, 0))
 
 
 Value = TypeVar("Value")
@@ -204,7 +186,6 @@ def _part(kind: Any, name: str, part: Any) -> Any:
 
 @lru_cache
 def _adapters(kind: Any) -> dict[str, TypeAdapter[Any]]:
-    """Return what checks each field that is no array."""
     hints = get_type_hints(kind)
     plain = (one.name for one in fields(kind) if get_origin(hints[one.name]) is not np.ndarray)
     return {name: TypeAdapter(hints[name]) for name in plain}
@@ -255,9 +236,11 @@ RAY_BYTES: Final = 10  # of one ray in a record; a frame has at most one for eac
 
 def rays_record(rays: RayCloud, grain: RayGrain) -> dict[str, Any]:
     """Return rays as a tree of arrays and plain values."""
+    # Between neighbours in the image: small numbers, which compress, written as positive ones of
+    # which every second stands for a step back (0, −1, 1, −2 become 0, 1, 2, 3).
+    steps = np.diff(rays.places, axis=0, prepend=np.zeros((1, 3), np.int16))
     return {
-        # Of neighbours in the image: small numbers, which compress.
-        "steps": _zigzag(np.diff(rays.places, axis=0, prepend=np.zeros((1, 3), np.int16))),
+        "steps": ((steps << 1) ^ (steps >> 15)).view(np.uint16),
         "sigma_m": rays.sigma_m,
         "confidence": rays.confidence,
         "count": rays.count,
@@ -273,20 +256,11 @@ def rays_in(content: Mapping[str, Any]) -> tuple[RayCloud, RayGrain]:
     if not (ordered and np.isfinite(sizes_m).all()):
         raise FormatError("sizes of the rays are impossible", got=sizes_m)
     steps = frozen_array("steps", content["steps"], np.uint16, (None, 3))
-    places = np.cumsum(_unzigzag(steps), axis=0, dtype=np.int16)
+    places = np.cumsum(((steps >> 1) ^ -(steps & 1)).view(np.int16), axis=0, dtype=np.int16)
     if array_in(content, "sigma_m", np.float16, (len(places),)).min(initial=0.0) < 0:
         raise FormatError("a ray of the map has a negative deviation")
     parts = {name: content[name] for name in ("sigma_m", "confidence", "count")}
     return value_in(RayCloud, {"places": places, **parts, "unit_m": grain.unit_m}), grain
-
-
-def _zigzag(steps: NDArray[np.int16]) -> NDArray[np.uint16]:
-    """Return steps of either sign as small positive numbers: 0, −1, 1, −2 become 0, 1, 2, 3."""
-    return ((steps << 1) ^ (steps >> 15)).view(np.uint16)
-
-
-def _unzigzag(codes: NDArray[np.uint16]) -> NDArray[np.int16]:
-    return ((codes >> 1) ^ -(codes & 1)).view(np.int16)
 
 
 RIG: Final = "rig"

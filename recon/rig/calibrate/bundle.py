@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import CalibrationError
+from recon.core.geometry.alignment import Problem, minimise
 from recon.core.geometry.se3 import apply, exp_so3, make_transform, orthonormalise, step_jacobian
-from recon.core.least_squares import Problem, minimise
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64, Int32
 from recon.stereo.rectify.lens import project_raw, project_with_jacobian

@@ -58,7 +58,6 @@ class BatchOptions:
     fail_fast: bool = False
 
     def connect(self) -> AbstractContextManager[Cluster]:
-        """Return the workers, for ``with``."""
         if self.scheduler is not None:
             return join_cluster(self.scheduler)
         return local_cluster(self.workers or available_cores())
@@ -119,10 +118,7 @@ class Cluster:
                 give(islice(waiting, _AT_ONCE // 2))
 
     def each(self, function: Callable[[Any], None], items: Sequence[Any]) -> None:
-        """Run a function with each item on some worker, and wait until all is done.
-
-        One whose worker dies is called again on another, at most as often as Dask allows.
-        """
+        """Run a function with each item on a worker, again if that dies, and wait for all."""
         futures = self._client.map(function, items, key=uuid4().hex)
         for future in require("distributed", extra=EXTRA).as_completed(futures):
             if future.status == "finished":
@@ -136,7 +132,12 @@ class Cluster:
         self, jobs: list[Job], folder: str, workers: Sequence[str]
     ) -> Iterator[tuple[Job, Any]]:
         """Give jobs to Dask, all with the same needs in one message."""
-        declared = self._declared() if any(job.needs for job in jobs) else ()
+        declared: frozenset[str] = frozenset()  # what all workers do
+        if any(job.needs for job in jobs):
+            with _reaching():
+                workers_now = self._client.scheduler_info(n_workers=-1)["workers"].values()
+            names = [frozenset(worker["resources"]) for worker in workers_now]
+            declared = frozenset.intersection(*names) if names else declared
         groups: dict[tuple[tuple[str, float], ...], list[Job]] = {}
         for job in jobs:
             needs = tuple((name, job.needs[name]) for name in declared if name in job.needs)
@@ -153,12 +154,6 @@ class Cluster:
                 allow_other_workers=bool(workers),  # where these die, too
             )
             yield from zip(alike, futures, strict=True)
-
-    def _declared(self) -> frozenset[str]:
-        with _reaching():
-            workers = self._client.scheduler_info(n_workers=-1)["workers"]
-        names = [frozenset(worker["resources"]) for worker in workers.values()]
-        return frozenset.intersection(*names) if names else frozenset()
 
 
 @contextmanager

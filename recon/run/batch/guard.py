@@ -13,12 +13,6 @@ import signal
 import threading
 
 
-def main() -> None:
-    """Watch the pipe and run the program."""
-    threading.Thread(target=_end_with_the_pipe, daemon=True).start()
-    runpy.run_module("recon", run_name="__main__", alter_sys=True)
-
-
 def _end_with_the_pipe() -> None:
     while os.read(0, 1024):
         pass
@@ -26,4 +20,5 @@ def _end_with_the_pipe() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    threading.Thread(target=_end_with_the_pipe, daemon=True).start()
+    runpy.run_module("recon", run_name="__main__", alter_sys=True)

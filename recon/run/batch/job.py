@@ -93,10 +93,7 @@ class Outcome:
 
 
 def log_file(folder: Path, name: str) -> Path:
-    """Return the log of a job: what its tries said, between an `Outcome` at each begin and end.
-
-    A try is ``broken`` as long as it has not ended.
-    """
+    """Return the log of a job: what its tries said, between an `Outcome` at each begin and end."""
     return folder / LOGS / f"{name}.log"
 
 
@@ -133,7 +130,10 @@ def run_job(
     out, last = folder / job.name, last_outcome(folder, job.name)
     if last.state == "succeeded":
         return last
-    _wait_for_others(out, stopped)
+    # An earlier try, whose worker does not know yet that its scheduler is gone.
+    until = time.monotonic() + _OTHERS_S
+    while is_locked(lock_file(out)) and time.monotonic() < until and not stopped():
+        time.sleep(_LOOK_S)
     path, begun = log_file(folder, job.name), time.monotonic()
     path.parent.mkdir(exist_ok=True)
     refuse_links(path.parent)
@@ -161,18 +161,15 @@ def run_job(
     return ended
 
 
-def _wait_for_others(out: Path, stopped: Callable[[], bool]) -> None:
-    """Wait for an earlier try, whose worker does not know yet that its scheduler is gone."""
-    late = time.monotonic() + _OTHERS_S
-    while is_locked(lock_file(out)) and time.monotonic() < late and not stopped():
-        time.sleep(_LOOK_S)
-
-
 def _run(
     job: Job, line: list[str], out: Path, log: IO[bytes], stopped: Callable[[], bool]
 ) -> tuple[int, str]:
     """Run the process to its end; returns its exit code and the line in which it says why."""
     said = [""]
+    # The folder of the job cannot hide this program: from Python 3.11 on, the second keeps it from
+    # searching the working folder.
+    paths = filter(None, (str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH")))
+    environment = {"PYTHONPATH": os.pathsep.join(paths), "PYTHONSAFEPATH": "1"}
     try:
         with tempfile.TemporaryFile() as printed:
             process = subprocess.Popen(
@@ -182,7 +179,7 @@ def _run(
                 stdout=printed,
                 stderr=subprocess.PIPE,
                 start_new_session=True,
-                env=_environment(),
+                env={**os.environ, **environment},
             )
             listener = threading.Thread(
                 target=_listen, args=(process.stderr, log, said), daemon=True
@@ -197,7 +194,10 @@ def _run(
     except (OSError, OutputError, ValueError) as failure:
         return -1, str(failure)
     code, error = process.returncode, said[0].removeprefix("error: ")[:_LONGEST]
-    return (-1, why) if why else (code, error or _died(code))
+    if not error and code < 0:
+        memory = "; out of memory?" if -code == signal.SIGKILL else ""
+        error = f"its process was killed by signal {-code}{memory}"
+    return (-1, why) if why else (code, error or f"ended with exit code {code}")
 
 
 def _listen(stream: IO[bytes], log: IO[bytes], said: list[str]) -> None:
@@ -234,18 +234,3 @@ def _wait(process: subprocess.Popen[bytes], timeout_s: float, stopped: Callable[
         if process.stdin is not None:
             process.stdin.close()
     return why
-
-
-def _environment() -> dict[str, str]:
-    """Return the environment, in which the folder of the job cannot hide this program."""
-    paths = (str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH"))
-    # From Python 3.11 on, the second keeps it from searching the working folder.
-    path = os.pathsep.join(filter(None, paths))
-    return {**os.environ, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}
-
-
-def _died(code: int) -> str:
-    if code >= 0:
-        return f"ended with exit code {code}"
-    memory = "; out of memory?" if -code == signal.SIGKILL else ""
-    return f"its process was killed by signal {-code}{memory}"

@@ -54,10 +54,7 @@ class Entry(Settings):
 
 
 class JobList(Settings):
-    """What a batch is asked for: jobs, each with all combinations of the values of a sweep.
-
-    Relative paths begin in the folder.
-    """
+    """What a batch is asked for: jobs below a folder, each with all combinations of a sweep."""
 
     model_config = ConfigDict(strict=True)
 
@@ -116,14 +113,18 @@ def _job_list(content: Any, path: Path) -> JobList:
 
 
 def jobs_of_sources(command: str, sources: Sequence[str]) -> JobList:
-    """Return one job for each source, named by its last part.
-
-    Where two would have one name, each is named by as many of the last parts as tell all apart.
-    """
+    """Return one job for each source, named by as many last parts as tell all apart."""
     if not sources:
         raise SettingsError("there is no source", where=f"recon batch {command}")
-    names = zip(_names_of(sources), sources, strict=True)
-    jobs = [Entry(name=name, command=command, source=[one]) for name, one in names]
+    paths = [resolved(source).parts[1:] for source in sources]
+    for count in range(1, max(map(len, paths)) + 1):
+        names = [_name_of(parts[-count:]) for parts in paths]
+        if len({name.lower() for name in names}) == len(names):
+            break
+    else:  # the same source twice: `check_names` says so
+        names = [_name_of(parts[-1:]) for parts in paths]
+    named = zip(names, sources, strict=True)
+    jobs = [Entry(name=name, command=command, source=[one]) for name, one in named]
     return JobList(job=jobs, folder=str(Path.cwd()))
 
 
@@ -150,18 +151,7 @@ def name_of_swept(name: str, swept: Mapping[str, Any]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text as part of the name of a folder."""
     return re.sub(r"[^A-Za-z0-9_.+-]", "-", text)
-
-
-def _names_of(sources: Sequence[str]) -> list[str]:
-    """Return names of sources, by as many last parts of their paths as tell all apart."""
-    paths = [resolved(source).parts[1:] for source in sources]
-    for count in range(1, max(map(len, paths)) + 1):
-        names = [_name_of(parts[-count:]) for parts in paths]
-        if len({name.lower() for name in names}) == len(names):
-            return names
-    return [_name_of(parts[-1:]) for parts in paths]
 
 
 def _name_of(parts: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""What comes back from the jobs of a batch, and which of it is unusual."""
+"""What comes back from the jobs of a batch, also of one that is running; what of it is unusual."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ import json
 import math
 import os
 import statistics
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+from recon.core.errors import FormatError
 from recon.core.progress import series, stage
+from recon.io.atomic import is_locked
 from recon.io.files import read_text, reading
 from recon.run.batch.cluster import BatchOptions, Cluster
-from recon.run.batch.job import Job, Outcome, log_file
+from recon.run.batch.job import Job, Outcome, last_outcome, log_file
+from recon.run.batch.job_file import PLAN
+from recon.run.directory import lock_file
 from recon.run.run import SUMMARY
 
 ACCURACY: Final = (
@@ -66,7 +71,6 @@ class JobResult:
 
     @property
     def seconds(self) -> float:
-        """Time of its last try."""
         return self.last.seconds
 
     @property
@@ -111,7 +115,11 @@ def work_off(
 
 def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
     """Return the result of a job, with the figures of its summary."""
-    size = folder_bytes(folder / job.name)
+    size = 0
+    for place, _, names in os.walk(folder / job.name):
+        for name in names:
+            with suppress(OSError):  # others may be writing or removing them
+                size += Path(place, name).lstat().st_size
     if outcome.state != "succeeded":
         return JobResult(job, outcome, bytes=size)
     path = folder / job.name / SUMMARY
@@ -150,16 +158,6 @@ def urgency(facts: Mapping[str, Any], figures: Mapping[str, float]) -> tuple[Any
     return facts["state"] != "failed", -untrusted, -drift, "remark" not in facts
 
 
-def folder_bytes(folder: Path) -> int:
-    """Return the size of all files in a folder, which others may be writing or removing."""
-    size = 0
-    for place, _, names in os.walk(folder):
-        for name in names:
-            with suppress(OSError):
-                size += Path(place, name).lstat().st_size
-    return size
-
-
 def accuracies(figures: Iterable[Mapping[str, float]]) -> list[str]:
     """Return the names in `ACCURACY` of what jobs with these figures are judged by."""
     firsts = {next((name for name in ACCURACY if name in one), "") for one in figures}
@@ -182,7 +180,13 @@ def _remarks(group: Sequence[JobResult]) -> Iterator[tuple[str, str]]:
     compared = [name for name in names if name.rpartition(".")[2] in _LEAST_SPREAD]
     if len(done) < _LEAST_JOBS or not compared:
         return
-    far = {name: _far(name, [one.figures[name] for one in done]) for name in compared}
+    far: dict[str, list[float]] = {}  # by how many standard deviations worse than their median
+    for name in compared:
+        values, least = [one.figures[name] for one in done], _LEAST_SPREAD[name.rpartition(".")[2]]
+        median = statistics.median(values)
+        spread = _SIGMAS * statistics.median(abs(value - median) for value in values)
+        spread = math.copysign(max(spread, _LEAST_RATIO * abs(median), abs(least)), least)
+        far[name] = [(value - median) / spread for value in values]
     for number, one in enumerate(done):
         most, name = max((far[name][number], name) for name in compared)
         if most >= _UNUSUAL:
@@ -190,9 +194,35 @@ def _remarks(group: Sequence[JobResult]) -> Iterator[tuple[str, str]]:
             yield one.job.name, f"{name} {one.figures[name]:.4g} (usually {usual:.4g})"
 
 
-def _far(name: str, values: Sequence[float]) -> list[float]:
-    """Return by how many standard deviations figures are worse than their median."""
-    least, median = _LEAST_SPREAD[name.rpartition(".")[2]], statistics.median(values)
-    spread = _SIGMAS * statistics.median(abs(value - median) for value in values)
-    spread = math.copysign(max(spread, _LEAST_RATIO * abs(median), abs(least)), least)
-    return [(value - median) / spread for value in values]
+def watch_jobs(
+    folder: Path, jobs: Sequence[Job], every_s: float = 1.0
+) -> Iterator[list[JobResult]]:
+    """Yield how all jobs stand, every second until nobody runs the batch any more.
+
+    Raises:
+        FormatError: The folder is removed meanwhile.
+    """
+    done: dict[str, JobResult] = {}
+    running = True
+    while running:
+        running = is_locked(lock_file(folder))  # before the jobs, whose last state it then is
+        if not (folder / PLAN).is_file():
+            raise FormatError("the folder of the batch was removed", where=folder)
+        seen = [done.get(job.name) or _seen(job, folder, running=running) for job in jobs]
+        done.update((one.job.name, one) for one in seen if one.figures)
+        yield compare(seen)
+        if running:
+            time.sleep(every_s)
+
+
+def _seen(job: Job, folder: Path, *, running: bool) -> JobResult:
+    """Return how a job stands; what is half written is as if it were not there yet."""
+    last = Outcome()
+    try:
+        last = last_outcome(folder, job.name)
+        # A try that has not ended is written as one that broke.
+        if running and last.state == "broken" and not last.seconds:
+            last = replace(last, state="running", error="")
+        return result_of(job, last, folder)
+    except FormatError:
+        return JobResult(job, last)

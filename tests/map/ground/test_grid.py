@@ -13,8 +13,15 @@ from recon.map.builders import OccupancyBuilder, OccupancySettings
 from recon.map.ground import grid as grid_file
 from recon.map.ground import surface as ground_file
 from recon.map.ground.axes import AxesSettings, GroundPlane, estimate_ground, map_axes
-from recon.map.ground.driven import DrivenPath, is_driven, sweep
-from recon.map.ground.grid import GridSettings, drop_undecided, flatten, ground_depths
+from recon.map.ground.grid import (
+    DrivenPath,
+    GridSettings,
+    drop_undecided,
+    flatten,
+    ground_depths,
+    is_driven,
+    sweep,
+)
 from recon.map.ground.surface import GroundSettings, GroundSurface, add_floors, find_floors
 from recon.map.occupancy.part import OccupancyPart, free_part, join_occupancy
 from tests.map.walls import T_MAP_WORLD

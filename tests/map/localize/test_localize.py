@@ -14,8 +14,15 @@ from recon.map.drive.sequence import map_sequence
 from recon.map.localize import localizer as localizer_file
 from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive, StartPose, localize_sequence, open_localizer
-from recon.map.localize.surfaces import NOISE, Fit, describe_surfaces, fit_surfaces
-from recon.map.localize.surroundings import Correction, contrast, is_worthwhile
+from recon.map.localize.surroundings import (
+    NOISE,
+    Correction,
+    Fit,
+    contrast,
+    describe_surfaces,
+    fit_surfaces,
+    is_worthwhile,
+)
 from recon.map.map import Map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import SessionInfo

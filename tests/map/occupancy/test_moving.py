@@ -15,15 +15,19 @@ from recon.core.values import FREE, OCCUPIED, OccupancyGrid, PointCloud, RayClou
 from recon.core.values.arrays import Bool
 from recon.core.values.grid import log_odds
 from recon.export.cloud import export_cloud
-from recon.map.builders import MAX_PROBABILITY, OccupancyBuilder, thin_rays
+from recon.map.builders import MAX_PROBABILITY, OccupancyBuilder, Submap, thin_rays
 from recon.map.drive.mapper import SubmapBuilder
 from recon.map.drive.sequence import map_sequence
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.ground.grid import GridSettings, flatten
 from recon.map.ground.surface import GroundSurface
-from recon.map.occupancy.bodies import FrameObservations, dynamic_cells
-from recon.map.occupancy.error import disagreement, frame_pairs, still_there
-from recon.map.submaps import Submap
+from recon.map.occupancy.bodies import (
+    FrameObservations,
+    disagreement,
+    dynamic_cells,
+    frame_pairs,
+    still_there,
+)
 from recon.map.tiles import Tiles
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
@@ -105,9 +109,8 @@ def _tiles(*drives: Drive, remove: bool = True) -> Tiles:
     tiles = Tiles.of_submaps(submaps, config, T_MAP_WORLD, drives=[1] * len(drives))
     poses = np.stack([pose for drive in drives for pose in drive.poses])
     rays = [cloud for drive in drives for cloud in drive.rays]
-    return tiles.with_observations(
-        FrameObservations(config.occupancy, T_MAP_WORLD @ poses, rays.__getitem__)
-    )
+    tiles.observations = FrameObservations(config.occupancy, T_MAP_WORLD @ poses, rays.__getitem__)
+    return tiles
 
 
 def _clouds(*drives: Drive) -> list[PointCloud]:

@@ -14,7 +14,7 @@ from recon.commands.config import load_config
 from recon.map.drive.drive import Workspace
 from recon.map.drive.sequence import map_sequence
 from recon.map.map import Map
-from recon.map.store.finished import keep_map
+from recon.map.sessions.copying import keep_map
 from recon.street.settings import StreetScene
 from tests.scenery.film import RIG, Film, film
 

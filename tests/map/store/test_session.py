@@ -14,10 +14,9 @@ from recon.look.rig import RefinedRig
 from recon.map.fusion import join_fused
 from recon.map.map import Map
 from recon.map.occupancy.part import join_occupancy
-from recon.map.sessions.copying import copy_sessions
+from recon.map.sessions.copying import copy_sessions, keep_map
 from recon.map.sessions.joining import path_up_to
 from recon.map.sessions.placed import PlacedSubmaps
-from recon.map.store.finished import keep_map
 from recon.map.store.map_file import MapViews
 from recon.map.store.session import Session, SessionInfo
 from recon.map.store.trees import Link

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis.extra import numpy as some
 
 from recon.core.errors import FormatError, OutputError, ReconError
-from recon.map.store import database
+from recon.map.store import records
 from recon.map.store.records import Cache, Store
 
 KINDS = ("rays", "submap")
@@ -297,7 +297,7 @@ def test_a_record_whose_reading_is_cut_short_is_not_called_damaged(ended, copied
 
     with Store.temporary() as store, Store.temporary() as other:
         store.put("rays", 0, {"a": np.arange(9)})
-        monkeypatch.setattr(database, "bytearray", cut, raising=False)
+        monkeypatch.setattr(records, "bytearray", cut, raising=False)
         with pytest.raises((KeyboardInterrupt, FormatError)) as told:
             store.copy("rays", other) if copied else store.read("rays", 0)
     assert "damaged" not in str(told.value)

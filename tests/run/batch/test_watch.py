@@ -13,8 +13,7 @@ from recon.core.errors import FormatError
 from recon.io.atomic import take_lock
 from recon.run.batch.job import Outcome, log_file
 from recon.run.batch.job_file import JobList
-from recon.run.batch.results import JobResult, wrong_first
-from recon.run.batch.watch import watch_jobs
+from recon.run.batch.results import JobResult, watch_jobs, wrong_first
 from recon.run.directory import lock_file
 from tests.run.batch.jobs import job
 
