@@ -12,9 +12,8 @@ from recon.core.text import counted, metres
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.look.look import Look
-from recon.look.measures import MIN_FEATURES, Gaps
 from recon.look.rig import LATER, MOST_LATE, MOVES, RefinedRig
-from recon.look.sample import BLANK_DN, Sample
+from recon.look.sample import BLANK_DN, MIN_FEATURES, Gaps, Sample
 from recon.look.settings import AuditedSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MatchingSettings, settings_of

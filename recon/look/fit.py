@@ -18,11 +18,11 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
 from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.look.fault import Places, RigFault, shrink
-from recon.look.halves import disagreement, middles
 from recon.look.tracks import StereoTracks, turns
 from recon.odometry.kernels import bundle
 from recon.odometry.pose import (
     CAUCHY_SIGMAS,
+    MIN_INLIERS,
     SIGMA_D_PX,
     SIGMA_UV_PX,
     TrackWindow,
@@ -386,3 +386,45 @@ def _weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Fl
     residual = np.nan_to_num(reprojection(window, camera) / sigmas)
     square = np.square(residual).sum(axis=2)
     return residual, window.seen / (1.0 + square / CAUCHY_SIGMAS**2)
+
+
+def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> float:
+    """Return the standard deviation of a path's length by halves of the features, as a share.
+
+    That of the halves that disagree most: what is near is low, too, so that theirs do not add up.
+    ``windows`` are seen with the rig of the path; those with too few features to be halved do not
+    count. NaN = there are no others.
+    """
+
+    def measured(window: TrackWindow) -> list[float]:
+        every = np.ones(len(window.xyz_world), np.bool_)
+        halves = list(_halves(window)) if every.any() else []
+        if min((int(half.sum()) for half in halves), default=0) < MIN_INLIERS:
+            return []
+        lengths_m = [[_length_m(window, part, camera) for part in (half, ~half)] for half in halves]
+        return [_length_m(window, every, camera), *(one - other for one, other in lengths_m)]
+
+    with serial_algebra():
+        found = [one for one in side_by_side(measured, windows, threads=FEW) if one]
+    if not found:
+        return float("nan")
+    length_m, *apart_m = np.sum(found, axis=0)
+    return 0.5 * float(np.abs(apart_m).max() / length_m)
+
+
+def _halves(window: TrackWindow) -> Iterator[Bool]:
+    """Yield halves of the points (N,): the left, the upper and the farther ones."""
+    for place in middles(window).T:
+        yield place < np.median(place)
+
+
+def middles(window: TrackWindow) -> Float64:
+    """Return where points are in the middle of their tracks: column, row, disparity (N, 3)."""
+    return np.asarray(np.nansum(window.uvd, axis=0) / np.isfinite(window.uvd).sum(axis=0).clip(1))
+
+
+def _length_m(window: TrackWindow, chosen: Bool, camera: RectifiedCamera) -> float:
+    """Return how far the camera moved through a window, by some of its points."""
+    part = TrackWindow(window.T_world_camera, window.uvd[:, chosen], window.xyz_world[chosen])
+    first, last = adjust(part, camera).T_world_camera[[0, -1]]
+    return float(np.linalg.norm((invert(first) @ last)[:3, 3]))

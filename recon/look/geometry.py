@@ -10,8 +10,14 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.look.measures import LARGEST_SKEW, MIN_FEATURES, align_features, time_skew
-from recon.look.sample import Lagged, Sample
+from recon.look.sample import (
+    LARGEST_SKEW,
+    MIN_FEATURES,
+    Lagged,
+    Sample,
+    align_features,
+    time_skew,
+)
 from recon.stereo.rectify.features import PairFeatures, inspect_features, pool_features
 from recon.stereo.rectify.row_alignment import RowAlignment, align_rows
 

@@ -20,9 +20,20 @@ from recon.core.values import Recorded, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.look.geometry import Geometry, measure_geometry, measure_rigidity
-from recon.look.measures import Gaps, align_features, find_gaps
 from recon.look.rig import LEAST_FRAMES, KnownRig, RefinedRig, Tracked, refine, turned_to_meet
-from recon.look.sample import QUICK, THOROUGH, Extent, Sample, Sampler, Window, choose, plan_windows
+from recon.look.sample import (
+    QUICK,
+    THOROUGH,
+    Extent,
+    Gaps,
+    Sample,
+    Sampler,
+    Window,
+    align_features,
+    choose,
+    find_gaps,
+    plan_windows,
+)
 from recon.look.tracks import StereoTracks, Tracking
 from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource, check_source
