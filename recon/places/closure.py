@@ -18,10 +18,8 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.odometry.health import stretches, trusted_poses
 from recon.odometry.protocol import OdometryHealth
-from recon.places.fixes import Held
-from recon.places.loop import MIN_AGREEING, Loop
-from recon.places.places import Drift, drift_over, path_lengths
-from recon.places.pose_graph import PoseEdge, optimise_poses
+from recon.places.places import MIN_AGREEING, Drift, Loop, drift_over, path_lengths
+from recon.places.pose_graph import Held, PoseEdge, optimise_poses
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
 _KEPT: Final = 0.25  # least weight of a loop that is believed

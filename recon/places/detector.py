@@ -15,14 +15,16 @@ from recon.core.values import Disparity, Rectified, RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, freeze
 from recon.core.values.camera import project
 from recon.places.keyframe import Keyframe, coarse_of, coarse_points, make_keyframe, words_of
-from recon.places.loop import Loop, agreeing_loops, loop_sigmas
 from recon.places.places import (
     VIEW_DEG,
+    Loop,
     Place,
     Places,
     WordIndex,
+    agreeing_loops,
     drift_over,
     is_possible,
+    loop_sigmas,
     most_alike,
     reach_of,
 )

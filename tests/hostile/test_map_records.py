@@ -29,9 +29,9 @@ from recon.map.store.trees import Link
 from recon.map.submaps import Submap
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
-from recon.places.fixes import Fixes
 from recon.places.keyframe import Keyframe
-from recon.places.loop import Loop
+from recon.places.places import Loop
+from recon.places.pose_graph import Fixes
 from recon.stereo.rectify.row_alignment import as_raw
 from tests.hostile.refusals import refusal
 
