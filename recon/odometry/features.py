@@ -18,8 +18,7 @@ from recon.core.geometry.se3 import Motion, apply, invert
 from recon.core.values import Disparity, Rectified, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.core.values.camera import depth_from_disparity, project, unproject
-from recon.odometry.kernels.patches import Placing, place_patches
-from recon.odometry.kernels.slopes import Surface, fit_slopes
+from recon.odometry.kernels.patches import Placing, Surface, fit_slopes, place_patches
 from recon.odometry.pose import REPROJECTION_PX, TrackWindow
 from recon.odometry.protocol import OdometryFrame
 from recon.stereo.match.sad import halve

@@ -16,6 +16,10 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.odometry.pose import REPROJECTION_PX, KnownPose, LocatedCamera
 
+MAX_SIGMAS: Final = 4.7
+"""Two measures of one motion that differ by more standard deviations of their difference contradict
+each other: 0.1 % of right ones do, with six degrees of freedom."""
+
 MIN_HELD: Final = 8
 """Fewer tracks that agree on a translation give no pose. Two fix it; that six more of a hundred
 wrong ones, each with a chance of 1 %, agree with one of some hundred translations, happens once in

@@ -5,17 +5,23 @@ Where it goes is not integrated: the camera goes on as it did, as surely as it d
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any, Final
 
 import numpy as np
 
 from recon.core.geometry.se3 import Motion, hat, make_transform
-from recon.core.values import ImuRecord
+from recon.core.values import ImuRecord, Trajectory
 from recon.core.values.arrays import Float64
+from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.odometry.guide import Guided
-from recon.odometry.imu_runs import SeenRun
+from recon.odometry.protocol import OdometryFrame, OdometryResult
+from recon.odometry.visual import VisualOdometry
+from recon.sources.source import StereoSource
+from recon.stereo.frame import FrameReconstructor
 
 _SIGMAS: Final = 4.7
 _MOST_STEPS: Final = 5.0  # usual steps between two samples; over a longer gap nothing is known
@@ -232,3 +238,54 @@ def _summed(values: Float64, times_s: Float64) -> Float64:
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(times_s)[:, None]
     summed[1:] = np.cumsum(steps, axis=0)
     return summed
+
+
+_FIRST_FRAMES: Final = 24  # frames from the first on, by which up is found
+_SEEN_PARTS: Final = 4  # more parts, up to the end of the drive
+_FRAMES: Final = 12  # frames of each
+
+
+@dataclass(frozen=True, eq=False)
+class SeenRun:
+    """Poses of consecutive frames whose motions are trusted, and how well these are known."""
+
+    path: Trajectory
+    sigma_m: Float64  # (N - 1,), of each motion
+    sigma_rad: Float64  # (N - 1,)
+
+
+def seen_runs(source: StereoSource, reconstructor: FrameReconstructor) -> list[SeenRun]:
+    """Return runs from all over a drive, in order."""
+
+    def seen(part: tuple[int, int]) -> list[SeenRun]:
+        pairs = islice(source.frames(part[0]), part[1])
+        return list(_runs(OdometryFrame(*reconstructor.match_roughly(pair)) for pair in pairs))
+
+    rest = np.linspace(
+        _FIRST_FRAMES, max(_FIRST_FRAMES, len(source) - _FRAMES), _SEEN_PARTS
+    ).astype(int)
+    parts = [(0, _FIRST_FRAMES), *((int(start), _FRAMES) for start in np.unique(rest))]
+    with serial_algebra():
+        return [run for runs in side_by_side(seen, parts, threads=FEW) for run in runs]
+
+
+def _runs(frames: Iterable[OdometryFrame]) -> Iterator[SeenRun]:
+    odometry, run = VisualOdometry(), list[tuple[float, OdometryResult]]()
+    for frame in frames:
+        found = odometry.register(frame)
+        if found.health.begins or not found.health.ok:
+            yield from _run(run)
+            run = []
+        if found.health.ok:
+            run.append((frame.pair.timestamp_s, found))
+    yield from _run(run)
+
+
+def _run(found: list[tuple[float, OdometryResult]]) -> Iterator[SeenRun]:
+    if len(found) < 2:
+        return
+    path = Trajectory(
+        np.stack([result.T_world_camera for _, result in found]), np.array([t for t, _ in found])
+    )
+    sigmas = np.array([(r.health.sigma_m, np.deg2rad(r.health.sigma_deg)) for _, r in found[1:]])
+    yield SeenRun(path, *sigmas.T)

@@ -20,9 +20,16 @@ from recon.core.geometry.se3 import angle_rad, distance_in_sigmas, log_so3
 from recon.core.text import counted
 from recon.core.values import ImuRecord
 from recon.core.values.arrays import Float64
-from recon.odometry.imu import Gyro, ImuGuide, accelerations, doubt_forces, find_up, turns_after
-from recon.odometry.imu_runs import SeenRun
-from recon.odometry.prior import MAX_SIGMAS
+from recon.odometry.imu import (
+    Gyro,
+    ImuGuide,
+    SeenRun,
+    accelerations,
+    doubt_forces,
+    find_up,
+    turns_after,
+)
+from recon.odometry.guide import MAX_SIGMAS
 
 _LAGS_S: Final = np.linspace(-0.5, 0.5, 101)  # delays that are tried first
 _ROUNDS: Final = 15  # steps of the fit

@@ -34,7 +34,7 @@ from recon.odometry.pose import (
     newest_health,
     newest_information,
 )
-from recon.odometry.prior import MAX_SIGMAS
+from recon.odometry.guide import MAX_SIGMAS
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.stereo.rectify.features import match_features
 

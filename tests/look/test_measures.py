@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from recon.core.geometry.se3 import exp_so3
 from recon.core.values import RectifiedCamera
-from recon.look import measures
+from recon.look import sample as measures
 from recon.look.findings import Finding, verdict_of
 from recon.look.sample import QUICK, THOROUGH, plan_windows
 from recon.look.tracks import REACH

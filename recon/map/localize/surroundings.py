@@ -30,7 +30,7 @@ from recon.map.localize.surfaces import Fit, Surfaces, describe_surfaces, fit_su
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.kiss import IcpAlignment, KissIcp, KissIcpOptions, select_points
-from recon.odometry.prior import MAX_SIGMAS
+from recon.odometry.guide import MAX_SIGMAS
 from recon.odometry.protocol import OdometryFrame
 from recon.places.places import SIGMAS
 

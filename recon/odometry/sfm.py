@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import math
 import signal
+import tempfile
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
 
-from recon.core.errors import require
+from recon.core.errors import RegistrationError, SettingsError, require
 from recon.core.geometry.se3 import apply, invert
+from recon.core.text import counted
 from recon.core.values import RectifiedCamera, RectifiedPair
-from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.core.work import side_by_side
-from recon.odometry.sfm.found import Model
+from recon.core.values.arrays import Float32, Float64, Int64, UInt8
+from recon.core.work import Stopwatch, side_by_side
+from recon.odometry.health import name_frames
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.sources.source import StereoSource, check_source
+from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
 
 _PIXELS: Final = 1_300_000
 """Of the image in which features are found; larger ones are shrunk. They stay accurate to a tenth
@@ -297,3 +303,152 @@ def _apart(models: Sequence[Model]) -> tuple[Model, ...]:
         parts = (model.frames[new], based, model.points[new], model.sigmas[new])
         kept.append(Model(*parts, model.reprojection_px))
     return tuple(kept)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Pairs whose poses beside each other are known."""
+
+    frames: Int64  # (M,), their numbers in the source, ascending
+    T_world_camera: Float64  # (M, 4, 4), of the rectified left camera; the first is the identity
+    points: Int64  # (M,), points of the model that the left image shows
+    # (M, 2), standard deviations of position (metres) and rotation (degrees), given the points
+    sigmas: Float64
+    reprojection_px: float  # mean error of all features
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPoses:
+    """What structure from motion found of the pairs of a source."""
+
+    pairs: int  # number of pairs of the source
+    models: tuple[Model, ...]  # the largest first; no pair is in two of them
+
+    def figures(self) -> dict[str, Any]:
+        return {
+            "pairs": self.pairs,
+            "registered": len(self.models[0].frames),
+            "models": [len(model.frames) for model in self.models],
+            "reprojection_px": self.models[0].reprojection_px,
+        }
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know, the most important first."""
+        largest, *others = self.models
+        missing = self.pairs - len(largest.frames)
+        if not missing:
+            return []
+        apart = "; ".join(
+            f"{counted(len(one.frames), 'pair')} among themselves ({_named(one)})" for one in others
+        )
+        what = f"{missing} of {counted(self.pairs, 'pair')} could not be placed beside the others"
+        return [f"{what}, and are not in the map{f'; placed are {apart}' if apart else ''}"]
+
+
+def _named(model: Model) -> str:
+    return name_frames(model.frames.tolist())
+
+
+class FoundOdometry:
+    """An odometry whose poses are those that structure from motion found; the largest model counts.
+
+    Pairs that are not in it get the pose of one before, and are not to be trusted.
+
+    Args:
+        found: What was found; None = comes with `restore`.
+    """
+
+    def __init__(self, found: FoundPoses | None = None) -> None:
+        self._found = found
+        self._next = 0
+
+    @property
+    def found(self) -> FoundPoses:
+        if self._found is None:
+            raise RegistrationError("structure from motion has found nothing yet")
+        return self._found
+
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        model, index = self.found.models[0], self._next
+        self._next += 1
+        at = max(0, int(np.searchsorted(model.frames, index, side="right")) - 1)
+        T_world_camera = model.T_world_camera[at]
+        if model.frames[at] != index:
+            notes = ("structure from motion could not place it",)
+            return OdometryResult(T_world_camera, OdometryHealth(False, skipped=True, notes=notes))
+        points, (sigma_m, sigma_deg) = int(model.points[at]), model.sigmas[at].tolist()
+        health = OdometryHealth(
+            tracks=points, inliers=points, sigma_m=sigma_m, sigma_deg=sigma_deg,
+            reprojection_px=model.reprojection_px,
+        )  # fmt: skip
+        return OdometryResult(T_world_camera, health)
+
+    def state(self) -> dict[str, Any]:
+        models = {str(number): vars(model) for number, model in enumerate(self.found.models)}
+        return {"next": self._next, "pairs": self.found.pairs, "models": models}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        models = tuple(Model(**state["models"][key]) for key in sorted(state["models"], key=int))
+        self._found, self._next = FoundPoses(int(state["pairs"]), models), int(state["next"])
+
+
+def check_sfm(source: StereoSource) -> None:
+    """Refuse what structure from motion cannot work with, and say which package is missing."""
+    check_source(source, stereo=True)
+    load_colmap()
+    if source.live:
+        what = "structure from motion needs all pairs before it begins"
+        raise SettingsError(what, where=source.name, hint="record the drive, then recon map it")
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """How the poses of a source are found."""
+
+    rectification: RectificationSettings
+    folder: Path | None = None  # where temporary files may be; None = where the system has them
+    threads: int = 1
+    limit_mb: float | None = None  # memory
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)
+
+
+def find_poses(source: StereoSource, options: SfmOptions) -> FoundPoses:
+    """Find the poses of all pairs of a source, whatever their order.
+
+    Raises:
+        RegistrationError: No two pairs can be placed beside each other.
+        SettingsError: The source is live.
+        MissingDependencyError: The extra ``sfm`` is not installed.
+    """
+    check_sfm(source)
+    stage = options.stopwatch.stage
+    with (
+        tempfile.TemporaryDirectory(prefix="sfm-", dir=options.folder) as folder,
+        _plain_errors(source.name),
+    ):
+        rectifier = Rectifier(source.calibration, options.rectification)
+        work = Colmap(rectifier.camera, Path(folder), options.threads, options.limit_mb)
+        with stage("sfm_features"):
+            work.add_features(map(rectifier.rectify, source.frames()))
+        with stage("sfm_match"):
+            work.match(len(source))
+        with stage("sfm_map"):
+            models = work.map()
+    if not models:
+        raise RegistrationError(
+            "structure from motion found no two pairs that see the same",
+            where=source.name,
+            got=counted(len(source), "pair"),
+            hint="take pairs that overlap by half; recon pair makes a cloud of a single one",
+        )
+    return FoundPoses(len(source), models)
+
+
+@contextmanager
+def _plain_errors(where: str) -> Iterator[None]:
+    """Say in one line what COLMAP, whose errors are those of C++, cannot do."""
+    try:
+        yield
+    except (RuntimeError, ValueError, IndexError) as error:
+        what, hint = "structure from motion failed", "try --odometry visual"
+        raise RegistrationError(what, where=where, got=error, hint=hint) from error
