@@ -1,6 +1,11 @@
 """The fault of a rig with which disparities fit the motion, and rows meet.
 
 Bundle adjustment of a few windows that share the fault; poses and points are eliminated.
+
+The formal error of a path takes features as independent. What is left of the fault of a rig is not:
+all that is on one side of the image, near, or low is off alike. So each window is adjusted twice,
+with what lies on either side, above and below, near and far: estimates of one motion that share no
+feature. Half of their difference is what the two together may be off by.
 """
 
 from __future__ import annotations

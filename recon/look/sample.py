@@ -1,4 +1,7 @@
-"""Measures of single images, of series of images, and of features in motion."""
+"""Which frames of a drive a look reads, and what is measured in them.
+
+In single images, in series of images, and of features in motion.
+"""
 
 from __future__ import annotations
 

@@ -20,6 +20,7 @@ from recon.core.geometry.se3 import angle_rad, distance_in_sigmas, log_so3
 from recon.core.text import counted
 from recon.core.values import ImuRecord
 from recon.core.values.arrays import Float64
+from recon.odometry.guide import MAX_SIGMAS
 from recon.odometry.imu import (
     Gyro,
     ImuGuide,
@@ -29,7 +30,6 @@ from recon.odometry.imu import (
     find_up,
     turns_after,
 )
-from recon.odometry.guide import MAX_SIGMAS
 
 _LAGS_S: Final = np.linspace(-0.5, 0.5, 101)  # delays that are tried first
 _ROUNDS: Final = 15  # steps of the fit

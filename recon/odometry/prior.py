@@ -1,4 +1,7 @@
-"""The motion of the camera by other sensors: wheels, an inertial unit, a satellite receiver."""
+"""The motion of the camera by other sensors: wheels, an inertial unit, a satellite receiver.
+
+Its axes are those in which it agrees with what the cameras see.
+"""
 
 from __future__ import annotations
 

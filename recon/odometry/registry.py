@@ -1,4 +1,4 @@
-"""The odometries by name."""
+"""The odometries by name, and those that are not ours, whose poses and states are checked."""
 
 from __future__ import annotations
 

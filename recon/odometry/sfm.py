@@ -1,4 +1,11 @@
-"""COLMAP: features and matches of rectified pairs in its database, and the models they give."""
+"""Structure from motion over all pairs of a source, before the first of them is mapped, by COLMAP.
+
+Features of every image, matches between pairs that may see the same, and a model that grows by one
+pair after another, adjusted as a whole. The rig is held, so lengths are metres. Pairs that share
+nothing are in models of their own.
+
+Ref: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016.
+"""
 
 from __future__ import annotations
 

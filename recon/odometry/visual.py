@@ -21,7 +21,7 @@ from recon.odometry.features import (
     points_of,
     replenish,
 )
-from recon.odometry.guide import Guide, Guided
+from recon.odometry.guide import MAX_SIGMAS, Guide, Guided
 from recon.odometry.pose import (
     MIN_INLIERS,
     KnownPose,
@@ -34,7 +34,6 @@ from recon.odometry.pose import (
     newest_health,
     newest_information,
 )
-from recon.odometry.guide import MAX_SIGMAS
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.stereo.rectify.features import match_features
 

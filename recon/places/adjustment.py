@@ -4,6 +4,14 @@ A pose graph knows of a loop where its frames were measured to be, and of its ne
 odometry says. Here all keyframes agree at once on the points that they see: each is matched with
 those before it and with those of its loops, about 10 ms for each pair. All other frames follow by
 odometry, as between the nodes of a pose graph.
+
+To what the edges of the graph cost comes, of each sighting of a point, ``c² log(1 + r²/c²)``, with
+``r`` the difference of its column, row and disparity in standard deviations (Cauchy's loss). Their
+normal equations are those of the window of visual odometry (`recon.odometry.kernels.bundle`), node
+after node. The points are eliminated (Schur complement): what is left is sparse, since few nodes
+see the same points. A sighting takes about 1 kB.
+
+Ref: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 """
 
 from __future__ import annotations

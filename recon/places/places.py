@@ -1,4 +1,4 @@
-"""The places of a drive: which may be near by odometry, and which look similar."""
+"""The places of a drive: which may be near by odometry, which look similar, and loops that agree."""
 
 from __future__ import annotations
 

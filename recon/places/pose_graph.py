@@ -17,6 +17,8 @@ opposite motion in the axes of the later node, which the adjoint gives:
 what a switch on the edge costs where it is best set. Its slope is the weight ``(1 + χ²/h)⁻²``, a
 quarter at ``χ² = h``.
 
+**Measured positions**, by GNSS or a total station, are edges from one more node, the survey.
+
 **Solution.** Levenberg-Marquardt: a node has edges to few others, so the normal equations are
 sparse, and their factors nearly so.
 

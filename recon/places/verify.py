@@ -1,4 +1,4 @@
-"""Geometric verification of loops."""
+"""Geometric verification of loops: the motion between two stereo frames from points both see."""
 
 from __future__ import annotations
 

@@ -36,10 +36,9 @@ from recon.stereo.kernels import points
 from recon.stereo.kernels.finish import count_supporters
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MatchingSettings, check_matcher
-from recon.stereo.observe import Effort, Inspected, Matching, MeasuredDepth, Observer
+from recon.stereo.observe import Effort, Inspected, Matching, MeasuredDepth, Observer, Support
 from recon.stereo.rectify.features import inspect_pair
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
-from recon.stereo.support import Support
 
 _INSPECT_EVERY: Final = 50  # frames: swapped cameras and rows that are off do not change
 

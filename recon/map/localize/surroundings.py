@@ -29,8 +29,8 @@ from recon.map.localize.belief import MAX_SIGMA_DEG, MAX_SIGMA_M, Belief
 from recon.map.localize.surfaces import Fit, Surfaces, describe_surfaces, fit_surfaces, misfit
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
-from recon.odometry.kiss import IcpAlignment, KissIcp, KissIcpOptions, select_points
 from recon.odometry.guide import MAX_SIGMAS
+from recon.odometry.kiss import IcpAlignment, KissIcp, KissIcpOptions, select_points
 from recon.odometry.protocol import OdometryFrame
 from recon.places.places import SIGMAS
 

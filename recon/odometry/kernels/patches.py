@@ -1,9 +1,10 @@
-"""Patches of one image, found again in another that shows them larger, smaller or leaning.
+"""Patches of one image, found again in another that shows them larger, smaller or slanted.
 
-Where a camera drives up to a feature its patch grows, and one on the road leans too. A motion and a
-depth say how; with the patch warped accordingly, only its place is left to be found.
+Where a camera drives up to a feature its patch grows, and one on the road slants too. A motion and
+a depth say how; with the patch warped accordingly, only its place is left to be found. The slope of
+the surface that a feature is on is fitted to the disparities around it.
 
-The reference implementation in plain numpy is `tests/odometry/kernels/test_patches.py`.
+The reference implementations in plain numpy are in `tests/odometry/kernels/`.
 """
 
 from __future__ import annotations

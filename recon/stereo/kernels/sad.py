@@ -22,6 +22,7 @@ from recon.stereo.kernels.half_windows import (
     Halves,
     Scratch,
     Search,
+    Tiles,
     Views,
     next_half,
     offer_candidates,
@@ -38,7 +39,6 @@ from recon.stereo.kernels.simd.vectors import (
     where_equal,
     where_less,
 )
-from recon.stereo.kernels.tiles import Tiles
 
 Found: TypeAlias = tuple[Vector, Vector, Vector, Vector, Vector, Vector, Vector, Vector]
 """The best so far in `LANES` columns; see `_weigh`."""

@@ -19,15 +19,18 @@ from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
 from recon.stereo.kernels.half_windows import (
     Search,
+    Support,
+    Tiles,
     empty_scratch,
     empty_views,
     lay_out,
+    make_tiles,
+    offer_supported,
     widest_block,
 )
 from recon.stereo.kernels.minima import empty_minima
 from recon.stereo.kernels.refine import REFINED_BYTES, Refined, Rules, refine_minima, refined_in
 from recon.stereo.kernels.sad import sad_minima
-from recon.stereo.kernels.tiles import Support, Tiles, make_tiles, offer_supported
 from recon.stereo.match import search as common
 from recon.stereo.match.protocol import Matcher
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.stereo.kernels import evidence
+from recon.stereo.kernels import filling as evidence
 
 
 def nearest_reference(known, y, x, direction):

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.stereo.kernels import segments
+from recon.stereo.kernels import filling as segments
 
 DRAWS = np.random.default_rng(0).random((150, 3))
 NONE = -99.0

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
-from recon.stereo.kernels import steps
-from recon.stereo.match.steps import settle_steps
+from recon.stereo.kernels import filling as steps
+from recon.stereo.match.fill import settle_steps
 
 HEIGHT, WIDTH, EDGE, REACH = 60, 120, 70, 5
 
