@@ -352,12 +352,15 @@ def _of_rows(places: Places) -> tuple[Float64, Float64]:
 
 def _of_places(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _Shared:
     T_camera_world = invert(window.T_world_camera)
-    residual, weight = _weighted(window, camera)
+    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
+    # Residuals in sigmas, 0 where unseen, and the weights of `adjust`.
+    residual = np.nan_to_num(reprojection(window, camera) / sigmas)
+    square = np.square(residual).sum(axis=2)
+    weight = window.seen / (1.0 + square / CAUCHY_SIGMAS**2)
     frames, points = weight.shape
     xyz = np.stack([apply(T, window.xyz_world) for T in T_camera_world])
     by_place = _derivative(xyz, camera)
     by = [places.by_left, (places.by_left - places.by_right)[:, :, :1]]
-    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
     # A correction moves what is observed, a step what is predicted: hence the sign.
     J = -np.nan_to_num(np.concatenate(by, axis=2)) / sigmas[:, None]
     # What has no disparity has no residual and no derivative of one.
@@ -385,14 +388,6 @@ def _derivative(xyz: Float64, camera: RectifiedCamera) -> Float64:
     return np.stack([np.stack(row, -1) for row in rows], axis=-2)
 
 
-def _weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Float64]:
-    """Residuals (W, N, 3) in sigmas, 0 where unseen, and weights of `adjust` (W, N)."""
-    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
-    residual = np.nan_to_num(reprojection(window, camera) / sigmas)
-    square = np.square(residual).sum(axis=2)
-    return residual, window.seen / (1.0 + square / CAUCHY_SIGMAS**2)
-
-
 def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> float:
     """Return the standard deviation of a path's length by halves of the features, as a share.
 
@@ -403,7 +398,8 @@ def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> flo
 
     def measured(window: TrackWindow) -> list[float]:
         every = np.ones(len(window.xyz_world), np.bool_)
-        halves = list(_halves(window)) if every.any() else []
+        # The left, the upper and the farther points.
+        halves = [one < np.median(one) for one in middles(window).T] if every.any() else []
         if min((int(half.sum()) for half in halves), default=0) < MIN_INLIERS:
             return []
         lengths_m = [[_length_m(window, part, camera) for part in (half, ~half)] for half in halves]
@@ -415,12 +411,6 @@ def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> flo
         return float("nan")
     length_m, *apart_m = np.sum(found, axis=0)
     return 0.5 * float(np.abs(apart_m).max() / length_m)
-
-
-def _halves(window: TrackWindow) -> Iterator[Bool]:
-    """Yield halves of the points (N,): the left, the upper and the farther ones."""
-    for place in middles(window).T:
-        yield place < np.median(place)
 
 
 def middles(window: TrackWindow) -> Float64:

@@ -145,16 +145,12 @@ def _looked(
     if windows and source.stereo and len(source) >= LEAST_FRAMES:
         used, turn = _rows_met(source, used, config, windows)
         tracking = FrameReconstructor(used, config)
-    how = _Reading(rectifier, tracking, extent, shared=used is given)
-    sample, tracks = _read(source, windows, how)
+    sample, tracks = _read(source, windows, rectifier, tracking, extent, shared=used is given)
     geometry = measure_geometry(sample, rectifier.camera)
     rigidity = measure_rigidity(sample, rectifier.camera, geometry.alignment)
     found = replace(begun, rigidity=rigidity)
     if tracking is not None and sample.broken is None and not found.not_rigid:
-
-        def again(other: Rig) -> list[StereoTracks]:
-            return _track(source, windows, FrameReconstructor(other, config))
-
+        again = partial(_track_again, source, windows, config)
         found = refine(found, Tracked(tracks, used, turn, again), config, known)
         if not rig.refine:
             found = replace(found, calibration=given)
@@ -180,31 +176,31 @@ def _rows_met(
     return turned_to_meet(rig, alignment, config.rectification)
 
 
-@dataclass(frozen=True, eq=False)
-class _Reading:
-    """How windows are read."""
-
-    rectifier: Rectifier  # by the calibration given
-    tracking: FrameReconstructor | None  # with the rig that is to be refined
-    extent: Extent
-    shared: bool  # whether both rectify alike
-
-
 def _read(
-    source: StereoSource, windows: Sequence[Window], how: _Reading
+    source: StereoSource,
+    windows: Sequence[Window],
+    rectifier: Rectifier,
+    reconstructor: FrameReconstructor | None,
+    extent: Extent,
+    *,
+    shared: bool,
 ) -> tuple[Sample, list[StereoTracks]]:
-    """Read windows, side by side in threads: measure their pairs, and track features."""
-    chosen = choose(windows, how.extent)
+    """Read windows, side by side in threads: measure their pairs, and track features.
+
+    ``rectifier`` is by the calibration given, ``reconstructor`` with the rig that is to be refined;
+    ``shared`` = both rectify alike.
+    """
+    chosen = choose(windows, extent)
 
     def read(window: Window) -> tuple[Sample, list[StereoTracks]]:
-        sampler = Sampler(window, how.rectifier, how.extent, chosen)
-        tracking = None if how.tracking is None else Tracking(how.tracking)
+        sampler = Sampler(window, rectifier, extent, chosen)
+        tracking = None if reconstructor is None else Tracking(reconstructor)
         try:
             for number, pair in _pairs(source, window.start, window.stop):
                 view = None
                 if tracking is not None and window.tracked[0] <= number < window.tracked[1]:
                     view = tracking.add(pair)
-                sampler.add(number, pair, view if how.shared else None)
+                sampler.add(number, pair, view if shared else None)
         except ReconError as error:
             sampler.sample.broken = error
         return sampler.sample, [] if tracking is None else tracking.found
@@ -216,10 +212,11 @@ def _read(
     return sample, [one for _, tracks in parts for one in tracks]
 
 
-def _track(
-    source: StereoSource, windows: Sequence[Window], reconstructor: FrameReconstructor
+def _track_again(
+    source: StereoSource, windows: Sequence[Window], config: StereoSettings, rig: Rig
 ) -> list[StereoTracks]:
     """Track features through the same windows with another rig."""
+    reconstructor = FrameReconstructor(rig, config)
 
     def track(window: Window) -> list[StereoTracks]:
         tracking = Tracking(reconstructor)

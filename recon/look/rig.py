@@ -30,10 +30,7 @@ from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource
 from recon.stereo.frame import StereoSettings
 from recon.stereo.rectify.lens import project_raw
-from recon.stereo.rectify.rectifier import (
-    RectificationSettings,
-    turns_of,
-)
+from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
 from recon.stereo.rectify.row_alignment import RowAlignment, as_raw, correct_rig
 
 MIN_WINDOWS: Final = 6  # fewer windows do not show how much they contradict each other
@@ -350,7 +347,13 @@ def _described(
     camera = turns_of(given, settings).camera
     changes = tuple(compare_rigs(given, refined, z, settings) for z in DEPTHS_M)
     rig = refined if changes[-1].moved_px > _LEAST_PX else given
-    return RefinedRig(given, rig, camera, fitted, changes, _mean_sigma(camera, fitted))
+    # How the mean disparity follows the parameters of the fault.
+    uv = spread_pixels(camera, _FIELD)
+    right_uv, none = uv + np.array([camera.doffs_px, 0.0]), np.zeros(len(fitted.values))
+    places = RigFault(camera).correct(uv, right_uv, none)
+    by = (places.by_left - places.by_right)[..., 0, :].reshape(-1, len(none)).mean(axis=0)
+    sigma_px = float(np.sqrt(by @ fitted.covariance @ by))
+    return RefinedRig(given, rig, camera, fitted, changes, sigma_px)
 
 
 def compare_rigs(
@@ -389,12 +392,3 @@ def turned_to_meet(
     if alignment is None or alignment.rms_px <= _MATCHED_ROWS_PX:
         return rig, np.zeros(len(TURN))
     return correct_rig(rig, alignment.turn, turns_of(rig, settings).R_left), alignment.turn
-
-
-def _mean_sigma(camera: RectifiedCamera, fitted: FittedFault) -> float:
-    """Return the standard deviation of the mean disparity that the fault explains."""
-    uv = spread_pixels(camera, _FIELD)
-    right_uv = uv + np.array([camera.doffs_px, 0.0])
-    places = RigFault(camera).correct(uv, right_uv, np.zeros(len(fitted.values)))
-    by = (places.by_left - places.by_right)[..., 0, :].reshape(-1, len(fitted.values)).mean(axis=0)
-    return float(np.sqrt(by @ fitted.covariance @ by))

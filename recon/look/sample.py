@@ -265,7 +265,8 @@ def plan_windows(frames: int, extent: Extent) -> list[Window]:
         after = np.linspace(REACH, frames, 2 * len(parts) + 1)[1::2].astype(int).tolist()
         parts += [(middle, middle) for middle in after]
     if frames <= extent.frames:
-        spans = list(pairwise([0, *(sum(at) // 2 for at in _between(parts)), frames]))
+        between = [(before[1] + after[0]) // 2 for before, after in pairwise(parts)]
+        spans = list(pairwise([0, *between, frames]))
     else:
         half = extent.frames // len(parts) // 2
         starts = [min(max(0, sum(part) // 2 - half), frames - 2 * half) for part in parts]
@@ -275,11 +276,6 @@ def plan_windows(frames: int, extent: Extent) -> list[Window]:
         Window(start, stop, part, _centres(start, stop, many, extent))
         for (start, stop), part in zip(spans, parts, strict=True)
     ]
-
-
-def _between(parts: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return the end of each part and the first frame of the next one."""
-    return [(before[1], after[0]) for before, after in pairwise(parts)]
 
 
 def _centres(start: int, stop: int, many: int, extent: Extent) -> tuple[int, ...]:
@@ -308,9 +304,8 @@ class PairMeasures:
     sharpness: Sides = (np.nan, np.nan)  # shares of the finest detail; NaN if unknown
     gains: Float64 = field(default_factory=_none)  # brightness ratios around features
     features: PairFeatures = NO_FEATURES  # matched features
-    flow: Float64 = field(
-        default_factory=_none
-    )  # (N,), rows by which each moves to the next frame; NaN = unknown
+    # (N,), rows by which each moves to the next frame; NaN = unknown
+    flow: Float64 = field(default_factory=_none)
     speed_m_per_s: float = np.nan  # of the rig; NaN if unknown
     # by how many frames after the left image the right image is taken from
     lagged: Mapping[int, Lagged] = field(default_factory=dict)

@@ -19,13 +19,7 @@ from recon.core.text import counted
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, Int64, UInt8, tree_of
 from recon.core.values.camera import depth_from_disparity, project, unproject
-from recon.odometry.protocol import (
-    Odometry,
-    OdometryFrame,
-    OdometryHealth,
-    OdometryResult,
-    pose_in,
-)
+from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult, pose_in
 
 _MAX_SIGMA_M: Final = 0.05  # largest standard deviation of a trusted motion on a road
 _MAX_SIGMA_SHARE: Final = 0.05  # share of the motion's length that is added to it
@@ -44,11 +38,8 @@ class CheckedState:
 class CheckedOdometry:
     """Checks how certain every motion is, and whether the image agrees with it.
 
-    Poses stay as they are; ``health.ok`` and its notes say which are not to be trusted.
-
-    Args:
-        odometry: Finds the poses.
-        scale: Size of the scene against a road.
+    Poses stay as they are; ``health.ok`` and its notes say which are not to be trusted. ``scale``
+    is the size of the scene against a road.
     """
 
     def __init__(self, odometry: Odometry, scale: float = 1.0) -> None:
@@ -101,12 +92,14 @@ class CheckedOdometry:
         if health.sigma_m > most_sigma_m(length_m, self._scale):
             return [f"the motion is known to {health.sigma_m:.2g} m only"]
         found = explain_motion(*views, T_before_now, camera)
+        patches = counted(found.informative, "patch", "patches")
         if found.informative >= _MIN_TELLING:
-            return _contradiction(found.share, found.informative)
+            if found.share >= MIN_SHARE:
+                return []
+            return [f"only {100 * found.share:.0f} % of {patches} of the image moved like that"]
         # A visual motion has passed the test of its uncertainty; any other has no other evidence.
         if np.isfinite(health.sigma_m):
             return []
-        patches = counted(found.informative, "patch", "patches")
         return [f"only {patches} of the image can distinguish motions"]
 
 
@@ -114,13 +107,6 @@ def most_sigma_m(length_m: float, scale: float) -> float:
     """Return the largest standard deviation of a trusted motion of that length."""
     # Among near things steps are long, and loops hold the path: there it may be more.
     return min(1.0, 2.5 * scale) * _MAX_SIGMA_M + _MAX_SIGMA_SHARE * length_m
-
-
-def _contradiction(share: float, informative: int) -> list[str]:
-    if share >= MIN_SHARE:
-        return []
-    patches = counted(informative, "patch", "patches")
-    return [f"only {100 * share:.0f} % of {patches} of the image moved like that"]
 
 
 _LEAST_NOISE: Final = 0.5  # grey values: rounding alone leaves 0.3
@@ -166,10 +152,7 @@ class _Samples:
 
 
 def explain_motion(
-    before: Sight,
-    now: Sight,
-    T_before_now: Float64,
-    camera: RectifiedCamera,
+    before: Sight, now: Sight, T_before_now: Float64, camera: RectifiedCamera
 ) -> Agreement:
     """Count the patches of the last image that match where a motion takes them in this one.
 
@@ -208,12 +191,7 @@ def noise_sigma(grey: UInt8) -> float:
     return max(float(np.median(np.abs(mixed))) / (6.0 * 0.6745), _LEAST_NOISE)
 
 
-def _sample(
-    before: Sight,
-    left: UInt8,
-    T_before_now: Float64,
-    camera: RectifiedCamera,
-) -> _Samples:
+def _sample(before: Sight, left: UInt8, T_before_now: Float64, camera: RectifiedCamera) -> _Samples:
     """Every n-th pixel with a disparity that stays in the image."""
     step, (height, width) = _STRIDE_PX, left.shape
     # Slopes need a neighbour on either side.
@@ -228,11 +206,9 @@ def _sample(
     grey = before.left.astype(np.int16)
     right, down = (grey[row, column + 1], grey[row + 1, column])
     slope = np.stack([right - grey[row, column - 1], down - grey[row - 1, column]], axis=1)
-    patch = (row // _PATCH_PX) * -(-width // _PATCH_PX)
-    patch += column // _PATCH_PX
-    return _Samples(
-        patch, grey[row, column].astype(np.float64), _interpolated(left, u, v), 0.5 * slope
-    )
+    patch = (row // _PATCH_PX) * -(-width // _PATCH_PX) + column // _PATCH_PX
+    values = grey[row, column].astype(np.float64)
+    return _Samples(patch, values, _interpolated(left, u, v), 0.5 * slope)
 
 
 def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:

@@ -5,7 +5,6 @@ Where it goes is not integrated: the camera goes on as it did, as surely as it d
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
@@ -17,13 +16,12 @@ from recon.core.geometry.se3 import Motion, hat, make_transform
 from recon.core.values import ImuRecord, Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.work import FEW, serial_algebra, side_by_side
-from recon.odometry.guide import Guided
+from recon.odometry.guide import MAX_SIGMAS, Guided
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
-_SIGMAS: Final = 4.7
 _MOST_STEPS: Final = 5.0  # usual steps between two samples; over a longer gap nothing is known
 
 
@@ -165,11 +163,8 @@ def find_up(gyro: Gyro, run: SeenRun, arm_m: Float64) -> tuple[Float64 | None, f
     path, begin_s = run.path, float(run.path.timestamps_s[0])
     near = path.timestamps_s <= begin_s + _UP_SPAN_S
     ends_s = path.timestamps_s[near] - begin_s
-    if (
-        near.sum() < 4
-        or ends_s[-1] < _LEAST_SPAN_S
-        or not gyro.knows(begin_s, begin_s + ends_s[-1])
-    ):
+    short = near.sum() < 4 or ends_s[-1] < _LEAST_SPAN_S
+    if short or not gyro.knows(begin_s, begin_s + ends_s[-1]):
         return None, float("nan")
     times_s, speed = _integrated(gyro, begin_s, float(ends_s[-1]))
     fallen_m = _summed(speed, times_s)
@@ -184,7 +179,7 @@ def find_up(gyro: Gyro, run: SeenRun, arm_m: Float64) -> tuple[Float64 | None, f
     covariance = np.linalg.inv((weight[:, None] * A).T @ (weight[:, None] * A))
     gravity, sigma = found[1], float(np.hypot(np.sqrt(covariance[1, 1]), _FORCE))
     sigma_deg = float(np.rad2deg(sigma / _G))
-    wrong = abs(float(np.linalg.norm(gravity)) - _G) > _SIGMAS * sigma
+    wrong = abs(float(np.linalg.norm(gravity)) - _G) > MAX_SIGMAS * sigma
     if wrong or sigma_deg > _MOST_UP_DEG:
         return None, sigma_deg
     return -gravity / np.linalg.norm(gravity), sigma_deg
@@ -258,8 +253,15 @@ def seen_runs(source: StereoSource, reconstructor: FrameReconstructor) -> list[S
     """Return runs from all over a drive, in order."""
 
     def seen(part: tuple[int, int]) -> list[SeenRun]:
-        pairs = islice(source.frames(part[0]), part[1])
-        return list(_runs(OdometryFrame(*reconstructor.match_roughly(pair)) for pair in pairs))
+        odometry, runs = VisualOdometry(), [list[tuple[float, OdometryResult]]()]
+        for pair in islice(source.frames(part[0]), part[1]):
+            frame = OdometryFrame(*reconstructor.match_roughly(pair))
+            found = odometry.register(frame)
+            if found.health.begins or not found.health.ok:
+                runs.append([])
+            if found.health.ok:
+                runs[-1].append((frame.pair.timestamp_s, found))
+        return [_run(run) for run in runs if len(run) > 1]
 
     rest = np.linspace(
         _FIRST_FRAMES, max(_FIRST_FRAMES, len(source) - _FRAMES), _SEEN_PARTS
@@ -269,23 +271,9 @@ def seen_runs(source: StereoSource, reconstructor: FrameReconstructor) -> list[S
         return [run for runs in side_by_side(seen, parts, threads=FEW) for run in runs]
 
 
-def _runs(frames: Iterable[OdometryFrame]) -> Iterator[SeenRun]:
-    odometry, run = VisualOdometry(), list[tuple[float, OdometryResult]]()
-    for frame in frames:
-        found = odometry.register(frame)
-        if found.health.begins or not found.health.ok:
-            yield from _run(run)
-            run = []
-        if found.health.ok:
-            run.append((frame.pair.timestamp_s, found))
-    yield from _run(run)
-
-
-def _run(found: list[tuple[float, OdometryResult]]) -> Iterator[SeenRun]:
-    if len(found) < 2:
-        return
+def _run(found: list[tuple[float, OdometryResult]]) -> SeenRun:
     path = Trajectory(
         np.stack([result.T_world_camera for _, result in found]), np.array([t for t, _ in found])
     )
     sigmas = np.array([(r.health.sigma_m, np.deg2rad(r.health.sigma_deg)) for _, r in found[1:]])
-    yield SeenRun(path, *sigmas.T)
+    return SeenRun(path, *sigmas.T)

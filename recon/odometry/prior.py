@@ -133,23 +133,24 @@ def find_axes(
     """
     tried: Sequence[Axes] = get_args(Axes) if settings.axes == "auto" else (settings.axes,)
     priors = {axes: MotionPrior(prior, _in_axes(settings, axes)) for axes in tried}
-    off = [_distances(priors, motion) for motion in _visual_motions(priors[tried[0]], frames)]
-    if not off:
+    motions = _visual_motions(priors[tried[0]], frames)
+    if not motions:
         return None
     sigmas: dict[str, float] = {
-        axes: float(np.median([one[axes] for one in off])) for axes in tried
+        axes: float(np.median([_distance(prior, motion) for motion in motions]))
+        for axes, prior in priors.items()
     }
     best = min(tried, key=lambda axes: sigmas[axes])
     if sigmas[best] > MAX_SIGMAS:
         misfits = ", ".join(f"{axes} axes {sigmas[axes]:.1f}" for axes in priors)
         raise RegistrationError(
             "the prior does not fit what the cameras see",
-            got=f"{misfits} standard deviations off in {counted(len(off), 'motion')}",
+            got=f"{misfits} standard deviations off in {counted(len(motions), 'motion')}",
             expected=f"at most {MAX_SIGMAS:g}",
             hint="it must be the path of this rig, in metres and on its clock; see "
             "odometry.prior.axes, and odometry.prior.sigma_m if it is no better",
         )
-    return FoundAxes(best, sigmas, len(off))
+    return FoundAxes(best, sigmas, len(motions))
 
 
 def first_moving(prior: Trajectory, stamps_s: Float64, settings: PriorSettings) -> int:
@@ -214,12 +215,8 @@ def _visual_motions(prior: MotionPrior, frames: Iterable[OdometryFrame]) -> list
     return motions
 
 
-def _distances(priors: Mapping[Axes, MotionPrior], seen: _VisualMotion) -> dict[Axes, float]:
-    """How far each prior is from a visual motion, in standard deviations."""
-    return {axes: _distance(prior, seen) for axes, prior in priors.items()}
-
-
 def _distance(prior: MotionPrior, seen: _VisualMotion) -> float:
+    """How far a prior is from a visual motion, in standard deviations."""
     expected = prior.motion(seen.from_s, seen.to_s)
     if expected is None:
         return float("inf")

@@ -77,7 +77,8 @@ class Colmap:
         self._api.set_random_seed(_SEED)
         self._camera, self._folder, self._threads = camera, folder, threads
         self._database = folder / "colmap.db"
-        self._most_pixels = most_pixels(limit_mb, threads)
+        quarter = math.inf if limit_mb is None else 1e6 * limit_mb / 4  # of the memory, bytes
+        self._most_pixels = min(_PIXELS, quarter / (_PIXEL_BYTES * threads))
         shrunk = camera.width_px * camera.height_px / self._most_pixels
         self._sigma_px = _SIGMA_PX * max(1.0, math.sqrt(shrunk))
 
@@ -121,7 +122,11 @@ class Colmap:
         options.min_model_size = 2
         options.extract_colors = False
         _hold_rig(options, "ba_refine_")
-        self._thresholds(options)
+        options.mapper.init_max_error = _VERIFIED * self._sigma_px
+        options.mapper.abs_pose_max_error = _REGISTERED * self._sigma_px
+        options.mapper.filter_max_reproj_error = _LEFT_OUT * self._sigma_px
+        options.triangulation.merge_max_reproj_error = _LEFT_OUT * self._sigma_px
+        options.triangulation.complete_max_reproj_error = _LEFT_OUT * self._sigma_px
         options.mapper.abs_pose_refine_focal_length = False
         options.mapper.abs_pose_refine_extra_params = False
         models, images = self._folder / "models", self._folder / "images"
@@ -134,14 +139,6 @@ class Colmap:
         for model in by_size:
             self._adjust(model)
         return _apart([_read_model(one, self._camera) for one in by_size])
-
-    def _thresholds(self, options: Any) -> None:
-        mapper, triangulation = options.mapper, options.triangulation
-        mapper.init_max_error = _VERIFIED * self._sigma_px
-        mapper.abs_pose_max_error = _REGISTERED * self._sigma_px
-        mapper.filter_max_reproj_error = _LEFT_OUT * self._sigma_px
-        triangulation.merge_max_reproj_error = _LEFT_OUT * self._sigma_px
-        triangulation.complete_max_reproj_error = _LEFT_OUT * self._sigma_px
 
     def _adjust(self, model: Any) -> None:
         """Adjust a model once more, so that wrong matches that are left count little."""
@@ -222,13 +219,6 @@ class Colmap:
 def _hold_rig(options: Any, prefix: str) -> None:
     for held in ("focal_length", "principal_point", "extra_params", "sensor_from_rig"):
         setattr(options, f"{prefix}{held}", False)
-
-
-def most_pixels(limit_mb: float | None, threads: int) -> float:
-    """Return the size of the largest image in which features are found, in pixels."""
-    if limit_mb is None:
-        return _PIXELS
-    return min(_PIXELS, 1e6 * limit_mb / (4 * _PIXEL_BYTES * threads))  # a quarter of the memory
 
 
 def find_features(image: UInt8, most: float) -> tuple[Float32, UInt8]:
@@ -346,14 +336,12 @@ class FoundPoses:
         if not missing:
             return []
         apart = "; ".join(
-            f"{counted(len(one.frames), 'pair')} among themselves ({_named(one)})" for one in others
+            f"{counted(len(one.frames), 'pair')} among themselves "
+            f"({name_frames(one.frames.tolist())})"
+            for one in others
         )
         what = f"{missing} of {counted(self.pairs, 'pair')} could not be placed beside the others"
         return [f"{what}, and are not in the map{f'; placed are {apart}' if apart else ''}"]
-
-
-def _named(model: Model) -> str:
-    return name_frames(model.frames.tolist())
 
 
 class FoundOdometry:

@@ -98,9 +98,8 @@ class VisualOdometry:
         if guided is not None:
             motion = state.motion.moved(guided.T_world_camera, time_s)
         expected = guided or Guided(motion.T_world_camera, np.eye(6))
-        seen = self._by_tracking(state, frame, expected) or self._by_matching(
-            state, frame, expected
-        )
+        seen = self._by_tracking(state, frame, expected)
+        seen = seen or self._by_matching(state, frame, expected)
         if seen is None:
             return self._lost(state, frame, motion, guided)
         if self._contradicts(state, seen, frame):

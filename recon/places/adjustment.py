@@ -121,12 +121,13 @@ def adjust_path(
     before, after = test.fit(start), test.fit(T_world_node)
     if not test.cost(after) < test.cost(before):
         return None
+    # How far what is seen is from where it should be, in the image.
+    off_px = [np.hypot(*test.residuals_px(state)[:, :2].T) for state in (before, after)]
     return Adjustment(
         bend_path(path, nodes, T_world_node),
         len(np.unique(known.seen.node)),
         known.seen.points,
-        _median_px(test, before),
-        _median_px(test, after),
+        *(float(np.nanmedian(off)) for off in off_px),
     )
 
 
@@ -238,12 +239,6 @@ def _tracks(pairs: Sequence[_Matches], nodes: NDArray[np.intp]) -> Sightings:
     return seen.of_points(np.arange(seen.points) % max(1, stride) == 0)
 
 
-def _median_px(bundle: Bundle, state: State) -> float:
-    """Return the median distance of what is seen from where it should be, in the image."""
-    off = bundle.residuals_px(state)
-    return float(np.nanmedian(np.hypot(off[:, 0], off[:, 1])))
-
-
 _ROUNDS: Final = 12
 _STILL: Final = 1e-4  # gain of a step, as a share of the cost, that is not worth another one
 _OF_MEDIAN: Final = 1.4826  # standard deviations of a normal error in a median absolute one
@@ -273,13 +268,6 @@ class Sightings:
         """Return those of some points (P,), numbered anew."""
         kept, number = chosen[self.point], np.cumsum(chosen) - 1
         return Sightings(self.node[kept], number[self.point[kept]], self.uvd[kept])
-
-    def by_node(self) -> Iterator[tuple[int, slice]]:
-        """Yield the nodes that see anything, and which sightings are theirs."""
-        nodes, begins = np.unique(self.node, return_index=True)
-        ends = [*begins[1:].tolist(), len(self.node)]
-        for node, begin, end in zip(nodes.tolist(), begins.tolist(), ends, strict=True):
-            yield node, slice(begin, end)
 
 
 class _Linear(NamedTuple):
@@ -315,12 +303,9 @@ class Bundle:
         xyz = np.einsum("mij,mj->mi", T[:, :3, :3], state[1][self.seen.point]) + T[:, :3, 3]
         return np.stack(project(xyz, self.camera), axis=1) - self.seen.uvd
 
-    def sightings_cost(self, state: State) -> float:
-        costs = (bundle.cost(*each, tuple(self._model)) for _, _, each in self._by_node(state))
-        return self.cauchy_sigmas**2 * sum(costs)
-
     def cost(self, state: State) -> float:
-        return self.graph.cost(state[0]) + self.sightings_cost(state)
+        costs = (bundle.cost(*each, tuple(self._model)) for _, _, each in self._by_node(state))
+        return self.graph.cost(state[0]) + self.cauchy_sigmas**2 * sum(costs)
 
     def linearise(self, state: State) -> _Linear:
         """Return the normal equations; of gradients, half."""
@@ -350,7 +335,10 @@ class Bundle:
             cross = self._by_free_node(linear.H_cross)
             folded = self._by_free_node(linear.H_cross @ inverse[self.seen.point])
             matrix, right = self.graph.equations(linear.graph)
-            matrix = csc_array(matrix + self._diagonal(linear.H_node) - folded @ cross.T)
+            blocks = linear.H_node[self.graph.free]
+            places = np.arange(len(blocks) + 1)
+            diagonal = bsr_array((blocks, places[:-1], places), shape=(6 * len(blocks),) * 2)
+            matrix = csc_array(matrix + diagonal - folded @ cross.T)
             right = right + linear.g_node[self.graph.free].ravel()
             found = solve_damped(matrix, right - folded @ linear.g_point.ravel(), damping)
             if found is None:
@@ -381,9 +369,12 @@ class Bundle:
         return bundle.BundleModel(*pinhole, sigma_uv, sigma_d, self.cauchy_sigmas)
 
     def _by_node(self, state: State) -> Iterator[tuple[int, slice, _OneFrame]]:
-        """Yield each node, which sightings are its, and them as a window of one frame."""
+        """Yield each node that sees anything, which sightings, and them as a window of a frame."""
         T_node_world, xyz = invert(state[0]), state[1]
-        for node, rows in self.seen.by_node():
+        nodes, begins = np.unique(self.seen.node, return_index=True)
+        ends = [*begins[1:].tolist(), len(self.seen.node)]
+        for node, begin, end in zip(nodes.tolist(), begins.tolist(), ends, strict=True):
+            rows = slice(begin, end)
             at, uvd = T_node_world[node : node + 1], self.seen.uvd[rows][None]
             yield node, rows, (at, uvd, xyz[self.seen.point[rows]])
 
@@ -401,9 +392,3 @@ class Bundle:
         begins = np.searchsorted(number[self.seen.node[kept]], np.arange(free.sum() + 1))
         shape = (6 * int(free.sum()), 3 * self.seen.points)
         return bsr_array((blocks[kept], self.seen.point[kept], begins), shape=shape)
-
-    def _diagonal(self, blocks: Float64) -> bsr_array:
-        """Return blocks (N, 6, 6) of the free nodes along the diagonal of a matrix."""
-        chosen = blocks[self.graph.free]
-        places = np.arange(len(chosen) + 1)
-        return bsr_array((chosen, places[:-1], places), shape=(6 * len(chosen),) * 2)

@@ -145,8 +145,7 @@ def join_drives(
 
     Ref: Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
-    ties_of = [_tied_frames(ties, number) for number in range(len(drives))]
-    nodes = _spaced(drives, ties_of)
+    nodes = _spaced(drives, ties)
     begins = np.cumsum([0, *map(len, nodes)]).tolist()
     share = 1.0 if held is None else USUAL
     chains = [
@@ -155,8 +154,9 @@ def join_drives(
     ]
     edges = [_tie_edge(tie, drives, nodes, begins) for tie in ties]
     start = [d.trajectory.T_world_camera[own] for d, own in zip(drives, nodes, strict=True)]
+    # Stretches are numbered so that no two drives have the same.
     parts = [
-        _numbered(d.stretch[own], k) for k, (d, own) in enumerate(zip(drives, nodes, strict=True))
+        d.stretch[own] + (k << 32) for k, (d, own) in enumerate(zip(drives, nodes, strict=True))
     ]
     root = longest_stretch(drives[0].stretch)
     begun = _beside(np.concatenate(start), np.concatenate(parts), root, ties, edges)
@@ -165,8 +165,13 @@ def join_drives(
     try:
         if held is None:
             poses, weights = _solve(begun, steps, edges, anchor)
-        else:
-            poses, weights = _solve_held(drives, nodes, begun, steps, edges, held)
+        else:  # with the survey as one more node, which is free
+            paths = [drive.trajectory for drive in drives]
+            poses = np.concatenate([begun, held.T_world_survey[None]])
+            for _ in range(_HELD_ROUNDS):
+                fixed = held.edges(paths, nodes, poses)
+                poses, weights = _solve(poses, [*steps, *fixed], edges)
+            poses = poses[:-1]
     except RegistrationError:
         return None
     bends = [np.mean([misfit(edge, poses) for edge in chain]) for chain in chains if chain]
@@ -174,8 +179,8 @@ def join_drives(
     if share**2 * max(bends, default=0.0) > _MAX_BEND_CHI2 or (ties and not kept.any()):
         return None
     solved = [poses[a:b] for a, b in pairwise(begins)]
-    paths = [bend_path(*each) for each in zip(drives, nodes, solved, strict=True)]
-    return JoinedDrives(tuple(paths), kept)
+    bent = [bend_path(*each) for each in zip(drives, nodes, solved, strict=True)]
+    return JoinedDrives(tuple(bent), kept)
 
 
 def loop_bias(loop: Loop, scale: float = 1.0) -> Drift:
@@ -199,18 +204,13 @@ def longest_stretch(stretch: NDArray[np.int64]) -> int:
     return int(np.bincount(stretch + 1, minlength=2)[1:].argmax())
 
 
-def _numbered(stretch: NDArray[np.int64], drive: int) -> NDArray[np.int64]:
-    """Return the stretches (N,) of a drive, numbered so that no other drive has the same."""
-    return stretch + (drive << 32)
-
-
-def _tied_frames(ties: Sequence[Tie], drive: int) -> list[int]:
-    ends = ((one, tie.loop) for tie in ties for one in zip(tie.drives, (0, 1), strict=True))
-    return sorted({(loop.first, loop.last)[end] for (number, end), loop in ends if number == drive})
-
-
-def _spaced(drives: Sequence[DrivePath], tied: Sequence[list[int]]) -> list[NDArray[np.intp]]:
+def _spaced(drives: Sequence[DrivePath], ties: Sequence[Tie]) -> list[NDArray[np.intp]]:
     """Return the frames of each drive that are nodes: at even distances, and where ties are."""
+    ends: list[set[int]] = [set() for _ in drives]
+    for tie in ties:
+        ends[tie.drives[0]].add(tie.loop.first)
+        ends[tie.drives[1]].add(tie.loop.last)
+    tied = [sorted(frames) for frames in ends]
     length_m = sum(float(drive.path_m[-1]) for drive in drives)
     gap_m = max(min(drive.scale for drive in drives) * _NODE_M, 2.0 * length_m / _MAX_NODES)
     if 2 * sum(map(len, tied)) > _MAX_NODES:
@@ -275,22 +275,6 @@ def _solve(
     return poses, weights[len(steps) :]
 
 
-def _solve_held(
-    drives: Sequence[DrivePath],
-    nodes: Sequence[NDArray[np.intp]],
-    start: Float64,
-    steps: list[PoseEdge],
-    ties: list[PoseEdge],
-    held: Held,
-) -> tuple[Float64, Float64]:
-    """Return poses and weights as `_solve`, with the survey as one more node, which is free."""
-    paths = [drive.trajectory for drive in drives]
-    poses = np.concatenate([start, held.T_world_survey[None]])
-    for _ in range(_HELD_ROUNDS):
-        poses, weights = _solve(poses, [*steps, *held.edges(paths, nodes, poses)], ties)
-    return poses[:-1], weights
-
-
 def odometry_edges(
     drive: DrivePath, nodes: NDArray[np.intp], begin: int, share: float
 ) -> list[PoseEdge]:
@@ -308,8 +292,8 @@ def odometry_edges(
         drift = drift_over(between_m, drive.scale)
         stated = np.repeat(drive.variance[last] - drive.variance[first], 3)
         T = invert(poses[first]) @ poses[last]
-        information = _inverse(share**2 * drift.covariance + np.diag(stated))
-        edges.append(PoseEdge(k, k + 1, T, information))
+        covariance = share**2 * drift.covariance + np.diag(stated)
+        edges.append(PoseEdge(k, k + 1, T, np.asarray(np.linalg.inv(covariance), np.float64)))
     return edges
 
 
@@ -327,7 +311,8 @@ def _tie_edge(
     covariance = np.linalg.inv(turn.T @ loop.information @ turn) + more.covariance
     T = orthonormalise(to_first @ loop.T_first_last @ invert(to_last))
     ends = begins[one] + first, begins[other] + last
-    return PoseEdge(*ends, T, _inverse(covariance), doubtful=True)
+    information = np.asarray(np.linalg.inv(covariance), np.float64)
+    return PoseEdge(*ends, T, information, doubtful=True)
 
 
 def _to_node(drive: DrivePath, nodes: NDArray[np.intp], frame: int) -> tuple[int, Float64, float]:
@@ -339,16 +324,10 @@ def _to_node(drive: DrivePath, nodes: NDArray[np.intp], frame: int) -> tuple[int
     return node, T, float(away_m[node])
 
 
-def _inverse(covariance: Float64) -> Float64:
-    """Return the information (6, 6) of a covariance (6, 6)."""
-    return np.asarray(np.linalg.inv(covariance), np.float64)
-
-
 def bend_path(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:
     """Return every pose moved with the nodes before and after it, interpolated by distance."""
     old, path_m = drive.trajectory.T_world_camera, drive.path_m
-    before = np.searchsorted(nodes, np.arange(len(old)), side="right") - 1
-    before = np.maximum(before, 0)
+    before = np.maximum(np.searchsorted(nodes, np.arange(len(old)), side="right") - 1, 0)
     after = np.minimum(before + 1, len(nodes) - 1)
     # A frame whose pose is not known goes on from the last node.
     same = drive.stretch[nodes[after]] == drive.stretch[nodes[before]]

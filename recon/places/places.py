@@ -1,4 +1,4 @@
-"""The places of a drive: which may be near by odometry, which look similar, and loops that agree."""
+"""The places of a drive: which may be near by odometry, which look alike, and loops that agree."""
 
 from __future__ import annotations
 
@@ -151,9 +151,8 @@ class _Run:
         found = end - begin
         before = np.cumsum(found) - found
         places = np.arange(found.sum()) + np.repeat(begin - before, found)
-        return np.bincount(self.owners[places], np.repeat(weight, found), self.count).astype(
-            np.float64
-        )
+        summed = np.bincount(self.owners[places], np.repeat(weight, found), self.count)
+        return summed.astype(np.float64)
 
 
 class WordIndex:

@@ -131,7 +131,11 @@ class PoseGraph:
         steps, chi2 = self._misfits(T_world_node)
         J_last = np.zeros((len(T), 6, 6))
         J_last[:, :3, :3] = (self.T_last_first @ T)[:, :3, :3]
-        J_last[:, 3:, 3:] = _right_inverse(steps[:, 3:])
+        # ``Jr⁻¹`` of the rotation vectors; below the least angle the factor is 1/12.
+        angle = np.maximum(np.linalg.norm(steps[:, 3:], axis=1), 1e-4)
+        factor = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+        K = hat(steps[:, 3:])
+        J_last[:, 3:, 3:] = np.eye(3) + 0.5 * K + factor[:, None, None] * (K @ K)
         J = np.concatenate([-J_last @ adjoint(invert(T)), J_last], axis=2)
         weighted = self._weights(chi2)[:, None, None] * self.information @ J
         return np.swapaxes(weighted, 1, 2) @ J, np.einsum("eij,ei->ej", weighted, steps)
@@ -238,14 +242,6 @@ def solve_damped(matrix: csc_array, right: Float64, damping: float) -> Float64 |
     return np.asarray(factors.solve(right))
 
 
-def _right_inverse(turns: Float64) -> Float64:
-    """Return ``Jr⁻¹`` (N, 3, 3) of rotation vectors (N, 3)."""
-    angle = np.maximum(np.linalg.norm(turns, axis=1), 1e-4)  # below, the factor is 1/12
-    factor = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
-    K = hat(turns)
-    return np.asarray(np.eye(3) + 0.5 * K + factor[:, None, None] * (K @ K))
-
-
 _NO_TURN: Final = 1e-9  # information of a rotation that was not measured; the optimiser needs some
 
 
@@ -277,14 +273,6 @@ class Fixes:
         """Return where a path has what was measured: float64 (N, 3), in its world."""
         return _placed(trajectory.T_world_camera[self.frames], self.offset_m)
 
-    def at_nodes(
-        self, trajectory: Trajectory, nodes: NDArray[np.intp]
-    ) -> tuple[NDArray[np.intp], Float64]:
-        """Return the node nearest to each measurement, and where it was in the node's axes."""
-        frames = np.searchsorted((nodes[1:] + nodes[:-1]) / 2, self.frames)
-        T_node_world = invert(trajectory.T_world_camera[nodes[frames]])
-        return frames, _placed(T_node_world, self.by_path(trajectory))
-
 
 NO_FIXES: Final = Fixes(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
 """Of a drive along which nothing was measured."""
@@ -309,7 +297,10 @@ class Held:
         survey, begin, edges = len(T_world_node) - 1, 0, list[PoseEdge]()
         R_survey_world = T_world_node[survey, :3, :3].T
         for path, own, fixes in zip(drives, nodes, self.fixes, strict=True):
-            near, offset_m = fixes.at_nodes(path, own)
+            # The node nearest to each measurement, and where that was in the node's axes.
+            near = np.searchsorted((own[1:] + own[:-1]) / 2, fixes.frames)
+            T_node_world = invert(path.T_world_camera[own[near]])
+            offset_m = _placed(T_node_world, fixes.by_path(path))
             for k in np.unique(near).tolist():
                 R = R_survey_world @ T_world_node[begin + k, :3, :3]
                 here = near == k

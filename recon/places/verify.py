@@ -80,9 +80,12 @@ def _aligned(first: Matchable, last: Matchable, scale: float) -> Alignment | str
     pairs, aligned = near
     if min(_spread(one) for one in _seen(first, last, pairs)) < _SPREAD_CELLS:
         return "inliers in one corner"
-    if _sigma_m(aligned.information) > scale * _MAX_SIGMA_M:
+    # How certain the translation is in its worst direction, if it is known in all.
+    values = np.linalg.eigvalsh(aligned.information)
+    if values[0] <= 1e-9 * values[-1]:
         return "motion not fixed"
-    return aligned
+    worst = np.linalg.eigvalsh(np.linalg.inv(aligned.information)[:3, :3])[-1]
+    return "motion not fixed" if np.sqrt(worst) > scale * _MAX_SIGMA_M else aligned
 
 
 def match_near(
@@ -208,14 +211,6 @@ def _spread(seen: Seen) -> int:
     return len(np.unique(row * _CELLS + column))
 
 
-def _sigma_m(information: Float64) -> float:
-    """The deviation of the translation in its worst direction; infinity = unknown."""
-    values = np.linalg.eigvalsh(information)
-    if values[0] <= 1e-9 * values[-1]:
-        return float("inf")
-    return float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information)[:3, :3])[-1]))
-
-
 MIN_INLIERS: Final = 15  # least number of matches that agree in both directions
 _LIMIT_SIGMAS: Final = 2.5  # largest distance from where a match should be, in each frame
 _MOST: Final = 300  # matches that are compared with one another, those of the nearest points
@@ -278,7 +273,10 @@ def find_motion(first: Seen, last: Seen) -> Alignment | None:
     sigma_m = np.hypot(ones.sigma_m, others.sigma_m)
     best, T_best = 0, np.eye(4)
     for seed in np.argsort(-rigid.sum(axis=1), kind="stable")[:_SEEDS]:
-        among = _companions(rigid, int(seed))
+        # Companions of the seed that are companions of at least half of the others.
+        among = np.flatnonzero(rigid[seed])
+        mutual = rigid[np.ix_(among, among)].sum(axis=1)
+        among = np.append(among[2 * mutual >= len(among)], seed)
         if len(among) < _FEWEST:
             continue
         # Depth errors grow with the square of the distance: the nearer half tells most.
@@ -313,13 +311,6 @@ def _keep_distances(first: Seen, last: Seen) -> Bool:
     # Points that errors of their depth do not tell apart say nothing of one another.
     alike = np.abs(apart[0] - apart[1]) <= tolerance
     return np.asarray(alike & (np.minimum(*apart) > tolerance))
-
-
-def _companions(rigid: Bool, seed: int) -> NDArray[np.intp]:
-    """Return the companions of a match that are companions of at least half of the others."""
-    among = np.flatnonzero(rigid[seed])
-    mutual = rigid[np.ix_(among, among)].sum(axis=1)
-    return np.append(among[2 * mutual >= len(among)], seed)
 
 
 def refine(first: Seen, last: Seen, T_first_last: Float64, *, steps: int = _STEPS) -> Alignment:

@@ -1,4 +1,4 @@
-"""Evidence for planes where nothing was measured, planes of segments, and votes beside steps of depth.
+"""Evidence for planes where nothing was measured, planes of segments, votes beside steps.
 
 A plane that goes on to where matches lie on it on all sides is what was seen, with a gap. One that
 is supported along one edge is a guess: the sky beside a roof is no roof.

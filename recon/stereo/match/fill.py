@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
@@ -66,7 +67,8 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
     all stays as it was. Where the image is black or white there is nothing to match: what was found
     there is rejected (`Reason.LOW_TEXTURE`).
     """
-    clipped = _clipped(pair.left)
+    level = cv2.blur(pair.left, (_CLIPPED_PX, _CLIPPED_PX))
+    clipped = (level < _CLIPPED_LEVELS) | (level > 255 - _CLIPPED_LEVELS)
     seen = seen.reject(clipped, Reason.LOW_TEXTURE)
     sure = seen.measured & (seen.confidence >= _UNLIKELY)
     if not sure.any():
@@ -97,12 +99,6 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
         sigma_px=np.where(filled, spread(seen.values), seen.sigma_px),
         reason=np.where(filled, np.uint8(Reason.FILLED), seen.reason),
     )
-
-
-def _clipped(grey: UInt8) -> Bool:
-    """Return where an image is black or white, but for noise: it shows nothing there."""
-    level = cv2.blur(grey, (_CLIPPED_PX, _CLIPPED_PX))
-    return np.asarray((level < _CLIPPED_LEVELS) | (level > 255 - _CLIPPED_LEVELS))
 
 
 def _distances(known: Bool, pool: Executor) -> UInt16:
@@ -138,20 +134,15 @@ def spread(values: Float32) -> Float32:
     float32 (H, W); of a uniform distribution from the least to the largest value around a pixel,
     and at least that of a flat minimum. Where none is around, of the whole map.
     """
-    low, high = _ends_around(values)
-    sigma = np.maximum((high - low) / np.sqrt(12), SIGMA_LARGEST_PX)
-    return np.asarray(sigma, dtype=np.float32)
-
-
-def _ends_around(values: Float32) -> tuple[Float32, Float32]:
-    """Return the least and the largest disparity around each pixel; of the whole map if none is."""
     known = np.isfinite(values)
     seen = values[known] if known.any() else np.zeros(1, np.float32)
     side = np.ones((2 * _AROUND_PX + 1,) * 2, np.uint8)
     high = cv2.dilate(np.where(known, values, np.float32(-np.inf)), side)
     low = cv2.erode(np.where(known, values, np.float32(np.inf)), side)
     none = low > high
-    return np.where(none, seen.min(), low), np.where(none, seen.max(), high)
+    low, high = np.where(none, seen.min(), low), np.where(none, seen.max(), high)
+    sigma = np.maximum((high - low) / np.sqrt(12), SIGMA_LARGEST_PX)
+    return np.asarray(sigma, dtype=np.float32)
 
 
 _LEVELS: Final = 8.0  # difference of grey levels at which the weight of a vote falls to 1/e
@@ -175,8 +166,10 @@ def settle_steps(pair: RectifiedPair, seen: Disparity, reach: int, pool: Executo
     against it.
     """
     own = _count_votes(pair, np.where(beyond_range(seen), _BEYOND, seen.values), reach, pool)
-    doubted = Disparity(seen.values, _doubted(seen.confidence, own), seen.sigma_px, seen.reason)
-    return doubted.reject(own < 0, Reason.EDGE)
+    # The odds of a disparity fall with the share of votes against it.
+    kept = np.exp(-_DOUBT * (1 - np.clip(own, 0, 1))).astype(np.float32)
+    sure = np.asarray(seen.confidence * kept / (1 - seen.confidence * (1 - kept)), np.float32)
+    return replace(seen, confidence=sure).reject(own < 0, Reason.EDGE)
 
 
 def _count_votes(pair: RectifiedPair, values: Float32, reach: int, pool: Executor) -> Float32:
@@ -209,12 +202,6 @@ def beyond_range(seen: Disparity) -> Bool:
     return np.asarray((cv2.medianBlur(at_limit, _NEIGHBOURS_PX) > 0) & ~seen.valid)
 
 
-def _doubted(confidence: Float32, own: Float32) -> Float32:
-    """Return confidences whose odds fall with the share of votes against a disparity."""
-    kept = np.exp(-_DOUBT * (1 - np.clip(own, 0, 1))).astype(np.float32)
-    return np.asarray(confidence * kept / (1 - confidence * (1 - kept)), np.float32)
-
-
 _EDGES: Final = (3, 6, 12, 24)
 """Differences of neighbouring colours, over three channels, above which there is an edge: from the
 noise of a good image to what divides any two surfaces. Which is right differs within one image, so
@@ -235,7 +222,12 @@ def fit_segments(
     Returns which share of the segment of a pixel lies on its plane, float32 (SEGMENTATIONS, H, W).
     """
     shares = np.zeros((SEGMENTATIONS, *guide.shape[:2]), np.float32)
-    steps, draws = _steps(guide), np.random.default_rng(0).random((_TRIES, 3))
+    # By how much each pixel differs from those above and to the left, over the channels.
+    steps = np.zeros(guide.shape[:2], np.uint16)
+    steps[1:] = cv2.absdiff(guide[1:], guide[:-1]).sum(axis=2, dtype=np.uint16)
+    beside = cv2.absdiff(guide[:, 1:], guide[:, :-1]).sum(axis=2, dtype=np.uint16)
+    steps[:, 1:] = np.maximum(steps[:, 1:], beside)
+    draws = np.random.default_rng(0).random((_TRIES, 3))
     for edge, planes, share in zip(_EDGES, to, shares, strict=True):
         alike = (steps <= edge).view(np.uint8)
         _, labels, stats, _ = cv2.connectedComponentsWithStats(alike, connectivity=4)
@@ -246,12 +238,12 @@ def fit_segments(
         wanted = wanted[wanted > 0]  # 0 are edges
         if len(wanted):
             known = seen.values, seen.confidence, order, starts, wanted, draws, SAME_SURFACE_PX
-            fit = partial(_fit, known, planes, share)
+            fit = partial(_fit_some, known, planes, share)
             common.in_strips(pool, threads, fit, len(wanted))
     return shares
 
 
-def _fit(known: _Known, to: Float32, shares: Float32, segments: range) -> None:
+def _fit_some(known: _Known, to: Float32, shares: Float32, segments: range) -> None:
     kernels.fit_segments(*known, segments.start, segments.stop, to, shares)
 
 
@@ -261,15 +253,6 @@ def smooth_colours(pair: RectifiedPair) -> UInt8:
     if colours is None:
         colours = np.repeat(pair.left[..., None], 3, axis=2)
     return np.asarray(cv2.blur(colours, (3, 3)), dtype=np.uint8)
-
-
-def _steps(guide: UInt8) -> UInt16:
-    """Return by how much each pixel differs from those above and to the left, over the channels."""
-    steps = np.zeros(guide.shape[:2], np.uint16)
-    steps[1:] = cv2.absdiff(guide[1:], guide[:-1]).sum(axis=2, dtype=np.uint16)
-    beside = cv2.absdiff(guide[:, 1:], guide[:, :-1]).sum(axis=2, dtype=np.uint16)
-    steps[:, 1:] = np.maximum(steps[:, 1:], beside)
-    return steps
 
 
 def fill_holes(values: Float32) -> Float32:

@@ -114,7 +114,15 @@ class FineMatcher:
         seen = self._paths.run(pair, partial(_copy_costs, volume), 0, paths, rules)
         if not seen.valid.any():
             return seen
-        values = search_planes(pair, seen, volume, _changes(s.min_disparity_px), self._threads)
+        changes = kernels.Changes(
+            per_px=_PER_PX * _LEVELS,
+            most=_MOST * _LEVELS,
+            most_at_edge=_EDGE_SHARE * _MOST * _LEVELS,
+            edge=sgm.EDGE_GREY_LEVELS,
+            outside=float(sgm.LEVELS),
+            minimum=s.min_disparity_px,
+        )
+        values = search_planes(pair, seen, volume, changes, self._threads)
         return _judged(pair, seen, values, (s.min_disparity_px, s.min_disparity_px + ndisp - 1))
 
     def _volume(self, pair: RectifiedPair, ndisp: int) -> UInt8:
@@ -127,7 +135,8 @@ class FineMatcher:
         left, right = fine_grey(pair.left, pair.left_rgb), fine_grey(pair.right, pair.right_rgb)
         level = float(left.mean())
         describers = [Describer(self._network, image, level) for image in (left, right)]
-        at_once = rows_at_once(width)
+        # As many rows as memory is meant for.
+        at_once = max(_PIXELS // width // _STEP * _STEP, 2 * _REACH)
 
         def prepare(rows: range) -> None:
             write_views(pair.right, _RADIUS, minimum, rows, views)
@@ -153,17 +162,6 @@ def _add_learned(
     left: Int32, right: Int32, width: int, minimum: int, costs: UInt8, rows: range
 ) -> None:
     add_unlikeness(left, right, width, minimum, _BLEND, rows.start, rows.stop, costs)
-
-
-def _changes(minimum: int) -> kernels.Changes:
-    return kernels.Changes(
-        per_px=_PER_PX * _LEVELS,
-        most=_MOST * _LEVELS,
-        most_at_edge=_EDGE_SHARE * _MOST * _LEVELS,
-        edge=sgm.EDGE_GREY_LEVELS,
-        outside=float(sgm.LEVELS),
-        minimum=minimum,
-    )
 
 
 def _copy_costs(volume: UInt8, _columns: int) -> WriteCosts:
@@ -331,11 +329,6 @@ _LARGEST_SUM: Final = 65_000  # of the sizes of weights: with any features a sum
 
 Network: TypeAlias = list[tuple[convolution.Layer, ...]]
 """The layers of each size; the last one gives its part of the features."""
-
-
-def rows_at_once(width: int) -> int:
-    """Return how many rows of an image to describe at a time: as many as memory is meant for."""
-    return max(_PIXELS // width // _STEP * _STEP, 2 * _REACH)
 
 
 class Describer:

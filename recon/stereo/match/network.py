@@ -42,9 +42,19 @@ class OnnxNetwork:
         runtime = require("onnxruntime", extra="onnx")
         if not path.is_file():
             raise FormatError("file does not exist", where=path, expected="an ONNX network")
-        _refuse_mistaken(path)
+        with path.open("rb") as file:
+            start = file.read(64).lstrip(b"\xef\xbb\xbf \r\n\t")
+        for beginning, (got, hint) in _MISTAKEN.items():
+            if start.startswith(beginning):
+                expected = "an ONNX network"
+                raise FormatError(
+                    "not a network", where=path, got=got, expected=expected, hint=hint
+                )
         self._path, self._limit_s, self._how = path, limit_s, runtime.RunOptions
-        self._errors = _errors_of(runtime)
+        # The exceptions of onnxruntime have no common base class.
+        state = vars(runtime.capi.onnxruntime_pybind11_state).values()
+        own = [kind for kind in state if isinstance(kind, type) and issubclass(kind, Exception)]
+        self._errors = (*own, RuntimeError, ValueError, TypeError)
         options = runtime.SessionOptions()
         options.intra_op_num_threads = threads or 0
         options.log_severity_level = 4  # fatal only: lesser errors arrive as exceptions
@@ -103,22 +113,6 @@ class OnnxNetwork:
             hint = "--set matching.onnx.time_limit_s= allows more"
             raise MatchingError(what, where=self._path, got=got, hint=hint)
         return list(running.result())
-
-
-def _refuse_mistaken(path: Path) -> None:
-    with path.open("rb") as file:
-        start = file.read(64).lstrip(b"\xef\xbb\xbf \r\n\t")
-    for beginning, (what, hint) in _MISTAKEN.items():
-        if start.startswith(beginning):
-            how = {"got": what, "expected": "an ONNX network", "hint": hint}
-            raise FormatError("not a network", where=path, **how)
-
-
-def _errors_of(runtime: Any) -> tuple[type[Exception], ...]:
-    """Return exceptions that onnxruntime raises: its own have no common base class."""
-    state = vars(runtime.capi.onnxruntime_pybind11_state).values()
-    own = [kind for kind in state if isinstance(kind, type) and issubclass(kind, Exception)]
-    return (*own, RuntimeError, ValueError, TypeError)
 
 
 def _first_line(error: Exception) -> str:

@@ -278,7 +278,12 @@ def rate_by_agreement(
         limit_px: Matches that differ by more are removed: as OCCLUDED where no pixel of the right
             view is matched with them, else as LEFT_RIGHT.
     """
-    apart = np.abs(values - _sampled(of_right, values))
+    rows, columns = np.mgrid[: values.shape[0], : values.shape[1]].astype(np.float32)
+    there = np.where(np.isfinite(values), columns - values, np.float32(-2))
+    sampled = cv2.remap(
+        of_right, there, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+    )
+    apart = np.abs(values - np.asarray(sampled, dtype=np.float32))
     agree = apart <= limit_px  # not where either is NaN
     reason = np.where(_seen(of_right), np.uint8(Reason.LEFT_RIGHT), np.uint8(Reason.OCCLUDED))
     reason[agree] = Reason.VALID
@@ -286,8 +291,8 @@ def rate_by_agreement(
     found = unrated_disparity(values, reason, pair)
     capped = np.where(agree, apart, np.float32(limit_px))
     mean_square = cv2.blur(capped * capped, (_WINDOW_PX, _WINDOW_PX))
-    disagreement = np.sqrt(mean_square)
-    sure = _confidence(disagreement)
+    odds = _ODDS * np.maximum(np.sqrt(mean_square), _LEAST_PX) ** -_POWER
+    sure = np.asarray(odds / (1 + odds), dtype=np.float32)
     # The difference of two estimates has twice the variance of each.
     sigma = np.sqrt(ASSUMED_SIGMA_PX**2 + mean_square / 2)
     both = np.sqrt(sure * sigma**2 + (1 - sure) * np.maximum(sigma, 1) ** 2)
@@ -296,22 +301,6 @@ def rate_by_agreement(
         confidence=np.where(found.valid, sure, 0).astype(np.float32),
         sigma_px=np.where(found.valid, both, np.nan).astype(np.float32),
     )
-
-
-def _confidence(disagreement: Float32) -> Float32:
-    odds = _ODDS * np.maximum(disagreement, _LEAST_PX) ** -_POWER
-    return np.asarray(odds / (1 + odds), dtype=np.float32)
-
-
-def _sampled(of_right: Float32, values: Float32) -> Float32:
-    """Return the right view's disparity where each left pixel is matched; NaN = beside it."""
-    height, width = values.shape
-    rows, columns = np.mgrid[:height, :width].astype(np.float32)
-    there = np.where(np.isfinite(values), columns - values, np.float32(-2))
-    sampled = cv2.remap(
-        of_right, there, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
-    )
-    return np.asarray(sampled, dtype=np.float32)
 
 
 def _seen(of_right: Float32) -> Bool:
