@@ -10,14 +10,7 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.look.sample import (
-    LARGEST_SKEW,
-    MIN_FEATURES,
-    Lagged,
-    Sample,
-    align_features,
-    time_skew,
-)
+from recon.look.sample import LARGEST_SKEW, MIN_FEATURES, Lagged, Sample, align_features, time_skew
 from recon.stereo.rectify.features import PairFeatures, inspect_features, pool_features
 from recon.stereo.rectify.row_alignment import RowAlignment, align_rows
 
@@ -58,27 +51,23 @@ def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
     if lag:
         features, skew = pool_features(one.features for one in lagged[lag]), None
         alignment = align_features(features, camera)
+    disparity_px = np.zeros(0)
+    if alignment is not None:
+        rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
+        shift = features.left_uv[:, 0] - features.right_uv[:, 0] + camera.doffs_px
+        aligned = np.abs(rows) < max(1.0, 3 * alignment.residual_px)
+        disparity_px = shift[aligned].astype(np.float64)
     return Geometry(
         pairs=len(each),
         features=features,
         matched=matched,
         alignment=alignment,
-        disparity_px=_disparities(features, alignment, camera),
+        disparity_px=disparity_px,
         swapped_share=inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_share,
         out_of_step=bool(lag) or _best_fit(lagged)[1] > _LAG_FACTOR,
         lag=lag,
         skew=skew,
     )
-
-
-def _disparities(
-    features: PairFeatures, alignment: RowAlignment | None, camera: RectifiedCamera
-) -> Float64:
-    if alignment is None:
-        return np.zeros(0)
-    rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
-    shift = features.left_uv[:, 0] - features.right_uv[:, 0] + camera.doffs_px
-    return shift[np.abs(rows) < max(1.0, 3 * alignment.residual_px)].astype(np.float64)
 
 
 def _best_lag(lagged: _ByLag, skew: tuple[float, float] | None, camera: RectifiedCamera) -> int:
@@ -168,9 +157,9 @@ def measure_rigidity(
         seen = one.features
         aligned = align_rows(seen.left_uv, seen.right_uv, camera)
         if aligned is not None and 2 * aligned.agreeing > len(seen):
-            right = (
-                seen.right_uv[:, 1] if common is None else common.turned_rows(seen.right_uv, camera)
-            )
+            right = seen.right_uv[:, 1]
+            if common is not None:
+                right = common.turned_rows(seen.right_uv, camera)
             left_px = float(np.median(right - seen.left_uv[:, 1]))
             found[one.index] = (aligned.mean_px, left_px)
     rows_px, apart_px = np.array([*found.values()]).reshape(-1, 2).T

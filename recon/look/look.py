@@ -44,26 +44,15 @@ from recon.stereo.rectify.rectifier import Rectifier
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a drive shows in windows of frames from all over it.
+    """What a drive shows in windows of frames from all over it."""
 
-    Attributes:
-        source: The drive; of one whose cameras are whole frames apart, as its images belong
-            together.
-        camera: Its rectified views, by the calibration given.
-        sample: What was measured in single pairs.
-        geometry: What all features show together.
-        rig: The rig as given, and as the motion shows it.
-        gaps: Frames that are missing, by their timestamps.
-        shifted: By how many frames right images were taken later than they were paired.
-    """
-
-    source: StereoSource
-    camera: RectifiedCamera
-    sample: Sample
-    geometry: Geometry
-    rig: RefinedRig
-    gaps: Gaps
-    shifted: int = 0
+    source: StereoSource  # with cameras that are whole frames apart, as images belong together
+    camera: RectifiedCamera  # its rectified views, by the calibration given
+    sample: Sample  # what was measured in single pairs
+    geometry: Geometry  # what all features show together
+    rig: RefinedRig  # as given, and as the motion shows it
+    gaps: Gaps  # frames that are missing, by their timestamps
+    shifted: int = 0  # by how many frames right images were taken later than they were paired
 
     @property
     def recorded(self) -> Sequence[Recorded]:

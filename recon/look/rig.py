@@ -322,10 +322,7 @@ def refine(
     fitted = replace(fitted, values=values)
     described = _described(begun.given, refined, fitted, config.rectification)
     return replace(
-        described,
-        begun_with=begun.begun_with,
-        period_s=begun.period_s,
-        rigidity=begun.rigidity,
+        described, begun_with=begun.begun_with, period_s=begun.period_s, rigidity=begun.rigidity
     )
 
 

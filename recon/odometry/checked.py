@@ -27,14 +27,6 @@ _MIN_TELLING: Final = 8  # with fewer usable patches the images say nothing
 MIN_SHARE: Final = 0.6  # least share of patches that must agree with a trusted motion
 
 
-@dataclass(frozen=True, eq=False)
-class CheckedState:
-    """What is kept from frame to frame."""
-
-    sight: Sight  # the last frame
-    T_world_camera: Float64  # (4, 4), its pose
-
-
 class CheckedOdometry:
     """Checks how certain every motion is, and whether the image agrees with it.
 
@@ -44,41 +36,34 @@ class CheckedOdometry:
 
     def __init__(self, odometry: Odometry, scale: float = 1.0) -> None:
         self.odometry, self._scale = odometry, scale
-        self._state: CheckedState | None = None
+        self._last: tuple[Sight, Float64] | None = None  # the last frame, and its pose
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        result, state = self.odometry.register(frame), self._state
-        if state is None and not result.health.ok:
+        result, last = self.odometry.register(frame), self._last
+        if last is None and not result.health.ok:
             return result
         sight = Sight(frame.pair.left, frame.disparity)
-        self._state = CheckedState(sight, result.T_world_camera)
-        if state is None or not result.health.ok or result.health.begins:
+        self._last = sight, result.T_world_camera
+        if last is None or not result.health.ok or result.health.begins:
             return result
-        T_before_now = invert(state.T_world_camera) @ result.T_world_camera
-        views = (state.sight, sight)
-        doubts = self._doubts(result.health, views, T_before_now, frame.pair.camera)
+        T_before_now = invert(last[1]) @ result.T_world_camera
+        doubts = self._doubts(result.health, (last[0], sight), T_before_now, frame.pair.camera)
         notes = (*result.health.notes, *doubts)
         return replace(result, health=replace(result.health, ok=not doubts, notes=notes))
 
     def state(self) -> dict[str, Any]:
-        last = self._state
-        if last is None:
-            return {"odometry": self.odometry.state(), "last": None}
-        return {
-            "odometry": self.odometry.state(),
-            "last": {
-                "left": last.sight.left,
-                "disparity": tree_of(last.sight.disparity),
-                "T_world_camera": last.T_world_camera,
-            },
-        }
+        last = None
+        if self._last is not None:
+            sight, T = self._last
+            last = {"left": sight.left, "disparity": tree_of(sight.disparity), "T_world_camera": T}
+        return {"odometry": self.odometry.state(), "last": last}
 
     def restore(self, state: dict[str, Any]) -> None:
         self.odometry.restore(state["odometry"])
-        last, self._state = state["last"], None
+        last, self._last = state["last"], None
         if last is not None:
             sight = Sight(last["left"], Disparity(**last["disparity"]))
-            self._state = CheckedState(sight, pose_in(last, "T_world_camera"))
+            self._last = sight, pose_in(last, "T_world_camera")
 
     def _doubts(
         self,
@@ -133,7 +118,7 @@ class Sight:
     """What the check needs of a frame."""
 
     left: UInt8  # (H, W)
-    disparity: Disparity  # its disparity
+    disparity: Disparity
 
     @cached_property
     def noise(self) -> float:

@@ -18,7 +18,7 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import invert, orthonormalise
 from recon.core.text import counted
 from recon.core.values import Disparity, PointCloud
-from recon.core.values.arrays import Bool, Float32, Float64, UInt8
+from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.core.values.camera import depth_from_disparity, depth_sigma, unproject
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.odometry.visual import VisualOdometry
@@ -236,7 +236,9 @@ def select_points(frame: OdometryFrame, max_range_m: float, beyond: float = 1.0)
         good &= sigma <= beyond * max_range_m / _RANGE
     good &= textured(frame.pair.left, _MIN_GRADIENT)
     good &= consistent(frame.disparity, _MAX_DISPARITY_STEP_PX)
-    return _cloud(frame, depth, sigma, good)
+    v, u = np.nonzero(good)
+    xyz = unproject(u, v, depth[good], camera)
+    return PointCloud(xyz=xyz, sigma_m=sigma[good], frame="camera")
 
 
 def textured(grey: UInt8, min_gradient: float) -> Bool:
@@ -252,9 +254,3 @@ def consistent(disparity: Disparity, max_step_px: float) -> Bool:
     """
     values = np.where(disparity.valid, disparity.values, np.float32(-1e6)).astype(np.float32)
     return np.asarray(disparity.valid & (np.abs(cv2.medianBlur(values, 5) - values) <= max_step_px))
-
-
-def _cloud(frame: OdometryFrame, depth: Float32, sigma: Float32, where: Bool) -> PointCloud:
-    v, u = np.nonzero(where)
-    xyz = unproject(u, v, depth[where], frame.pair.camera)
-    return PointCloud(xyz=xyz, sigma_m=sigma[where], frame="camera")

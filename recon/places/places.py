@@ -44,44 +44,21 @@ class Places:
 
     def __init__(self, scale: float = 1.0) -> None:
         self._scale = scale
-        self._frames: list[int] = []
-        self._poses = np.empty((64, 4, 4))
-        self._path_m = np.empty(64)
-        self._stretches = np.empty(64, np.int64)
+        self.frames: list[int] = []
+        self.T_world_camera: Float64 = np.empty((0, 4, 4))
+        self.path_m: Float64 = np.empty(0)
+        self.stretches: NDArray[np.int64] = np.empty(0, np.int64)  # that each belongs to
         self._words = WordIndex()
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self.frames)
 
     def add(self, place: Place) -> None:
-        count = len(self)
-        if count == len(self._path_m):
-            self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
-            self._path_m = np.concatenate([self._path_m, np.empty_like(self._path_m)])
-            self._stretches = np.concatenate([self._stretches, np.empty_like(self._stretches)])
-        self._poses[count], self._path_m[count] = place.T_world_camera, place.path_m
-        self._stretches[count] = place.stretch
-        self._frames.append(place.frame)
+        self.frames.append(place.frame)
+        self.T_world_camera = np.concatenate([self.T_world_camera, place.T_world_camera[None]])
+        self.path_m = np.append(self.path_m, place.path_m)
+        self.stretches = np.append(self.stretches, place.stretch)
         self._words.add(place.words)
-
-    @property
-    def frames(self) -> list[int]:
-        return self._frames
-
-    @property
-    def T_world_camera(self) -> Float64:
-        """float64 (N, 4, 4)."""
-        return self._poses[: len(self)]
-
-    @property
-    def path_m(self) -> Float64:
-        """float64 (N,)."""
-        return self._path_m[: len(self)]
-
-    @property
-    def stretches(self) -> NDArray[np.int64]:
-        """int64 (N,), stretch of the drive that each belongs to."""
-        return self._stretches[: len(self)]
 
     def near(self, place: Place) -> Bool:
         """Return bool (N,), those of its stretch that drift allows to be in view of a later one."""
@@ -301,15 +278,14 @@ def fit_to_path(
     ``drift_m`` is by how much the path may be off at its end, standard deviation.
     """
     rigid, scaled = (fit_points(ours_m, position_m, scaled=scaled) for scaled in (False, True))
-    path_m = float(np.linalg.norm(np.diff(ours_m, axis=0), axis=1).sum())
-    spread_m = _apart_m(ours_m, ours_m.mean(axis=0))
+    path_m = max(float(np.linalg.norm(np.diff(ours_m, axis=0), axis=1).sum()), _SHORTEST_M)
+    spread_m = max(_apart_m(ours_m, ours_m.mean(axis=0)), _SHORTEST_M)
     return PathFit(
         rms_m=_apart_m(apply(rigid.T_to_from, ours_m), position_m),
         scaled_m=_apart_m(apply(scaled.T_to_from, scaled.scale * ours_m), position_m),
         scale=scaled.scale,
         most_m=SIGMAS * math.hypot(drift_m, sigma_m),
-        most_stretch=SIGMAS
-        * math.hypot(drift_m / max(path_m, _SHORTEST_M), sigma_m / max(spread_m, _SHORTEST_M)),
+        most_stretch=SIGMAS * math.hypot(drift_m / path_m, sigma_m / spread_m),
     )
 
 
@@ -382,32 +358,31 @@ def agreeing_loops(
     own. ``keyframes`` is the least number of later keyframes among loops that agree, ``scale`` that
     of the scene.
     """
-    poses, near_m = (firsts, lasts), scale * _NEAR_M
+    near_m, sigmas = scale * _NEAR_M, loop_sigmas(scale)
+
+    def closes(one: Loop, other: Loop) -> bool:
+        """Whether two loops agree within the drift of the odometry between them."""
+        T_lasts, lasts_m = _between(one.last, other.last, lasts)
+        T_firsts, firsts_m = _between(one.first, other.first, firsts)
+        ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
+        return is_possible(ring, drift_over(lasts_m + firsts_m, scale), sigmas)
+
     paths_m = np.array([(firsts[loop.first][1], lasts[loop.last][1]) for loop in loops])
     between = np.array([(firsts[loop.first][2], lasts[loop.last][2]) for loop in loops])
     agreeing = []
     for number, loop in enumerate(loops):
         firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
         near = np.flatnonzero((lasts_m <= near_m) & (between == between[number]).all(axis=1))
-        rings = {k: _closes(loop, loops[k], poses, scale) for k in near.tolist()}
+        rings = {k: closes(loop, loops[k]) for k in near.tolist()}
         # Counted by keyframes: how many views of a place each finds is chance.
-        against = {loops[k].last for k, closes in rings.items() if not closes}
+        against = {loops[k].last for k, closed in rings.items() if not closed}
         # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
-        same = [loops[k] for k, closes in rings.items() if closes and firsts_m[k] <= near_m]
+        same = [loops[k] for k, closed in rings.items() if closed and firsts_m[k] <= near_m]
         behind = {other.last for other in same}
         enough = max(keyframes, _MAJORITY * len(against))
         if len(same) >= MIN_AGREEING and len(behind) >= enough:
             agreeing.append(loop)
     return agreeing
-
-
-def _closes(one: Loop, other: Loop, poses: tuple[Poses, Poses], scale: float) -> bool:
-    """Whether two loops agree within the drift of the odometry between them."""
-    firsts, lasts = poses
-    T_lasts, lasts_m = _between(one.last, other.last, lasts)
-    T_firsts, firsts_m = _between(one.first, other.first, firsts)
-    ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
-    return is_possible(ring, drift_over(lasts_m + firsts_m, scale), loop_sigmas(scale))
 
 
 def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:

@@ -14,13 +14,7 @@ from recon.core.geometry.se3 import apply, as_transform, invert, step_jacobian
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.core.values.camera import project
-from recon.places.keyframe import (
-    Keyframe,
-    coarse_grid,
-    coarse_points,
-    feature_sigma_px,
-    points_of,
-)
+from recon.places.keyframe import Keyframe, coarse_grid, coarse_points, feature_sigma_px, points_of
 from recon.places.places import Loop
 
 _CELLS: Final = 4

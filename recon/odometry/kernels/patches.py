@@ -27,19 +27,12 @@ _FLAT: Final = 1e-9
 
 
 class Placing(NamedTuple):
-    """How patches are placed.
+    """How patches are placed."""
 
-    Attributes:
-        radius: Half width of a patch, pixels.
-        steps: Gauss-Newton steps at most.
-        close: Length of a step, pixels, below which it is the last.
-        reach: Largest distance between the guess and the place, pixels, along either axis.
-    """
-
-    radius: int
-    steps: int
-    close: float
-    reach: float
+    radius: int  # half width of a patch, pixels
+    steps: int  # Gauss-Newton steps at most
+    close: float  # length of a step, pixels, below which it is the last
+    reach: float  # largest distance between the guess and the place, pixels, along either axis
 
 
 def place_patches(
@@ -197,21 +190,13 @@ _RIDGE: Final = 1.0  # squared pixels: neighbours in one line fix no slope acros
 
 
 class Surface(NamedTuple):
-    """What counts as of one surface.
+    """What counts as of one surface."""
 
-    Attributes:
-        radius: Half width of the neighbourhood, pixels.
-        step: Every so many rows and columns of it are looked at.
-        near: Largest distance of a neighbour from the plane, in disparity.
-        least: Neighbours on the plane, with fewer of which it counts as upright.
-        rounds: Fits, each to the neighbours that are on the last plane.
-    """
-
-    radius: int
-    step: int
-    near: float
-    least: int
-    rounds: int
+    radius: int  # half width of the neighbourhood, pixels
+    step: int  # every so many rows and columns of it are looked at
+    near: float  # largest distance of a neighbour from the plane, in disparity
+    least: int  # neighbours on the plane, with fewer of which it counts as upright
+    rounds: int  # fits, each to the neighbours that are on the last plane
 
 
 def fit_slopes(values: Float32, uv: Float64, surface: Surface) -> Float64:

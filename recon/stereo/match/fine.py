@@ -100,9 +100,9 @@ class FineMatcher:
         parts = []
         for strip in divided(height, rows, _OVERLAP_ROWS):
             part = self._match(_rows(pair, strip.start, strip.end), ndisp)
-            kept = slice(strip.first - strip.start, strip.last - strip.start)
+            maps = part.values, part.confidence, part.sigma_px, part.reason
             parts.append(
-                (part.values[kept], part.confidence[kept], part.sigma_px[kept], part.reason[kept])
+                [one[strip.first - strip.start : strip.last - strip.start] for one in maps]
             )
         return Disparity(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
@@ -150,9 +150,7 @@ class FineMatcher:
                 common.in_strips(pool, self._threads, work, height)
             for first in range(0, height, at_once):
                 end = min(first + at_once, height)
-                ours, others = (
-                    each.describe(first, end, pool, self._threads) for each in describers
-                )
+                ours, others = (d.describe(first, end, pool, self._threads) for d in describers)
                 add = partial(_add_learned, ours, others, width, minimum, volume[first:end])
                 common.in_strips(pool, self._threads, add, end - first)
         return volume
@@ -222,11 +220,7 @@ on those of the segments that it is in."""
 
 
 def search_planes(
-    pair: RectifiedPair,
-    seen: Disparity,
-    volume: UInt8,
-    changes: kernels.Changes,
-    threads: int,
+    pair: RectifiedPair, seen: Disparity, volume: UInt8, changes: kernels.Changes, threads: int
 ) -> Float32:
     """Return the disparity of the plane that each pixel takes, float32 (H, W), without NaN.
 
