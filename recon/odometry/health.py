@@ -131,9 +131,9 @@ def expected_drift(
     trusted pose do not count: `health_warnings` names them.
     """
     steps_m = np.linalg.norm(np.diff(path.positions_m, axis=0), axis=1)
-    figures = np.array([(h.scale_px, h.sigma_m, h.sigma_deg) for h in health[1:]])
-    known = np.isfinite(figures).all(axis=1) if len(figures) else np.zeros(0, np.bool_)
-    known &= np.array([h.ok for h in health[1:]], dtype=np.bool_)
+    stated = [(h.scale_px, h.sigma_m, h.sigma_deg) for h in health[1:]]
+    figures = np.array(stated).reshape(-1, 3)
+    known = np.isfinite(figures).all(axis=1) & trusted_poses(health[1:])
     length_m = float(steps_m[known].sum())
     if not length_m > 0.0:
         return None

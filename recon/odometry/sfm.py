@@ -417,18 +417,19 @@ def find_poses(source: StereoSource, options: SfmOptions) -> FoundPoses:
     """
     check_sfm(source)
     stage = options.stopwatch.stage
-    with (
-        tempfile.TemporaryDirectory(prefix="sfm-", dir=options.folder) as folder,
-        _plain_errors(source.name),
-    ):
-        rectifier = Rectifier(source.calibration, options.rectification)
-        work = Colmap(rectifier.camera, Path(folder), options.threads, options.limit_mb)
-        with stage("sfm_features"):
-            work.add_features(map(rectifier.rectify, source.frames()))
-        with stage("sfm_match"):
-            work.match(len(source))
-        with stage("sfm_map"):
-            models = work.map()
+    try:
+        with tempfile.TemporaryDirectory(prefix="sfm-", dir=options.folder) as folder:
+            rectifier = Rectifier(source.calibration, options.rectification)
+            work = Colmap(rectifier.camera, Path(folder), options.threads, options.limit_mb)
+            with stage("sfm_features"):
+                work.add_features(map(rectifier.rectify, source.frames()))
+            with stage("sfm_match"):
+                work.match(len(source))
+            with stage("sfm_map"):
+                models = work.map()
+    except (RuntimeError, ValueError, IndexError) as error:  # those of C++
+        what, hint = "structure from motion failed", "try --odometry visual"
+        raise RegistrationError(what, where=source.name, got=error, hint=hint) from error
     if not models:
         raise RegistrationError(
             "structure from motion found no two pairs that see the same",
@@ -437,13 +438,3 @@ def find_poses(source: StereoSource, options: SfmOptions) -> FoundPoses:
             hint="take pairs that overlap by half; recon pair makes a cloud of a single one",
         )
     return FoundPoses(len(source), models)
-
-
-@contextmanager
-def _plain_errors(where: str) -> Iterator[None]:
-    """Say in one line what COLMAP, whose errors are those of C++, cannot do."""
-    try:
-        yield
-    except (RuntimeError, ValueError, IndexError) as error:
-        what, hint = "structure from motion failed", "try --odometry visual"
-        raise RegistrationError(what, where=where, got=error, hint=hint) from error

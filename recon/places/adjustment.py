@@ -293,8 +293,13 @@ class Bundle:
 
     def fit(self, T_world_node: Float64) -> State:
         """Fit the free nodes and all points, from poses."""
+        # Each point begins where the node that is nearest to it sees it.
+        order = np.lexsort((-self.seen.uvd[:, 2], self.seen.point))
+        rows = order[np.unique(self.seen.point[order], return_index=True)[1]]
+        T, xyz = T_world_node[self.seen.node[rows]], points_of(self.seen.uvd[rows], self.camera)
+        points = np.einsum("pij,pj->pi", T[:, :3, :3], xyz) + T[:, :3, 3]
         problem = Problem(self.cost, self.linearise, self.step)
-        start = T_world_node, self._points_at(T_world_node)
+        start = T_world_node, np.asarray(points)
         return minimise(problem, start, rounds=_ROUNDS, min_gain=_STILL)
 
     def residuals_px(self, state: State) -> Float64:
@@ -377,13 +382,6 @@ class Bundle:
             rows = slice(begin, end)
             at, uvd = T_node_world[node : node + 1], self.seen.uvd[rows][None]
             yield node, rows, (at, uvd, xyz[self.seen.point[rows]])
-
-    def _points_at(self, T_world_node: Float64) -> Float64:
-        """Return each point where the node that is nearest to it sees it."""
-        order = np.lexsort((-self.seen.uvd[:, 2], self.seen.point))
-        rows = order[np.unique(self.seen.point[order], return_index=True)[1]]
-        T, xyz = T_world_node[self.seen.node[rows]], points_of(self.seen.uvd[rows], self.camera)
-        return np.asarray(np.einsum("pij,pj->pi", T[:, :3, :3], xyz) + T[:, :3, 3])
 
     def _by_free_node(self, blocks: Float64) -> bsr_array:
         """Return blocks (M, 6, 3) of sightings as a matrix, without the rows of fixed nodes."""

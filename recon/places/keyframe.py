@@ -53,17 +53,13 @@ class Keyframe:
         if nowhere or not self.coarse.size or np.isinf(self.coarse).any():
             raise ShapeError("a keyframe has no disparities, infinite ones, or features nowhere")
 
-    def xyz(self, camera: RectifiedCamera) -> Float64:
-        """Return float64 (N, 3), the features in camera axes; NaN where the depth is unknown."""
-        return points_of(self.uvd, camera)
-
     def depth_m(self, camera: RectifiedCamera) -> Float64:
         """Return float64 (h, w), depth of the coarse disparities; NaN = unknown."""
         return depth_from_disparity(self.coarse, camera).astype(np.float64)
 
 
 def points_of(uvd: NDArray[Any], camera: RectifiedCamera) -> Float64:
-    """Return points (N, 3) in camera axes of columns, rows and disparities (N, 3)."""
+    """Return points (N, 3) in camera axes of columns, rows and disparities (N, 3); NaN = unknown."""
     depth = depth_from_disparity(uvd[:, 2], camera).astype(np.float64)
     return unproject(uvd[:, 0].astype(np.float64), uvd[:, 1].astype(np.float64), depth, camera)
 

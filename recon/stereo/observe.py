@@ -72,16 +72,11 @@ class Support:
         return self.agreeing >= _LEAST_FEATURES and 2 * self.agreeing > self.matched
 
     @property
-    def by_pixels(self) -> bool:
-        """Whether dense matches support the pair; they do where hardly a corner is."""
+    def shown(self) -> bool:
+        """Whether anything supports the pair: dense matches do where hardly a corner is."""
         beyond = self.measured - self.by_chance
         clearly = self.times_chance >= _BY_PIXELS and beyond >= _LEAST_SHARE
-        return clearly or self.measured >= _MOSTLY
-
-    @property
-    def shown(self) -> bool:
-        """Whether anything supports the pair."""
-        return self.by_features or self.by_pixels
+        return self.by_features or clearly or self.measured >= _MOSTLY
 
     @property
     def doubtful(self) -> bool:

@@ -160,17 +160,14 @@ class OnnxMatcher:
         views = _fitted(left, size, multiple), _fitted(right, size, multiple)
 
         def match(*views: UInt8) -> Float32:
-            return self._run(network, views)
+            inputs = [_tensor(view, network.channels, self._use) for view in views]
+            if network.stacked:
+                inputs = [np.concatenate(inputs, axis=1)]
+            return _resized(self._disparity_of(network.run(inputs)), views[0].shape[:2])
 
         most = int(1e6 * self._settings.tile_megapixels) if size is None else views[0].size
         values = match_in_tiles(match, views, reach_px, most, multiple)
         return values[:height, :width] if size is None else _resized(values, (height, width))
-
-    def _run(self, network: OnnxNetwork, views: tuple[UInt8, ...]) -> Float32:
-        inputs = [_tensor(view, network.channels, self._use) for view in views]
-        if network.stacked:
-            inputs = [np.concatenate(inputs, axis=1)]
-        return _resized(self._disparity_of(network.run(inputs)), views[0].shape[:2])
 
     def _disparity_of(self, outputs: list[Float32]) -> Float32:
         """Return float32 (h, w), pixels of what was put in, NaN = none."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
 from recon.stereo.kernels.half_windows import (
     Search,
@@ -82,8 +82,12 @@ class SadMatcher:
         self._half = _StripSearch(self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        search, rules = self._plan(pair.camera)
         s = self._settings
+        ndisp, radius = s.ndisp_within(pair.camera), s.window_px // 2
+        # The middles of the two halves lie half a radius above and below the pixel.
+        slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
+        search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
+        rules = common.rules_of(s, ndisp, s.window_px**2, min_texture=_MIN_TEXTURE)
         with ThreadPoolExecutor(self._threads) as pool:
             enough = partial(common.texture, pair, s.window_px)
             tiles = self._tiles(pool, pair, search)
@@ -113,15 +117,6 @@ class SadMatcher:
 
         common.in_strips(pool, self._threads, offer, len(tiles.offered))
         return tiles
-
-    def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
-        s = self._settings
-        ndisp = s.ndisp_within(camera)
-        radius = s.window_px // 2
-        # The middles of the two halves lie half a radius above and below the pixel.
-        slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
-        search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
-        return search, common.rules_of(s, ndisp, s.window_px**2, min_texture=_MIN_TEXTURE)
 
 
 class _StripSearch:
