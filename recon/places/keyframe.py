@@ -59,7 +59,7 @@ class Keyframe:
 
 
 def points_of(uvd: NDArray[Any], camera: RectifiedCamera) -> Float64:
-    """Return points (N, 3) in camera axes of columns, rows and disparities (N, 3); NaN = unknown."""
+    """Return points (N, 3) in camera axes of columns, rows, disparities (N, 3); NaN = unknown."""
     depth = depth_from_disparity(uvd[:, 2], camera).astype(np.float64)
     return unproject(uvd[:, 0].astype(np.float64), uvd[:, 1].astype(np.float64), depth, camera)
 

@@ -1,6 +1,6 @@
 """Sums of absolute differences over a window, and the best candidate of each pixel.
 
-Why it is fast: a tile of the image is offered only some candidates (`tiles`). The inner loops
+Why it is fast: a tile of the image is offered only some candidates (`Tiles`). The inner loops
 work on `LANES` neighbouring columns at once (`simd`), with the best so far in registers. A window
 consists of two halves (`half_windows`), each of which is summed once for two rows, in blocks of
 columns that stay in a core's own cache. Two halves that are shifted against each other make a
