@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
+from typing import Final
 
 import numpy as np
 
@@ -19,8 +20,9 @@ from recon.core.text import counted
 from recon.core.values import Recorded, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.work import FEW, serial_algebra, side_by_side
+from recon.look.fault import TURN
 from recon.look.geometry import Geometry, measure_geometry, measure_rigidity
-from recon.look.rig import LEAST_FRAMES, KnownRig, RefinedRig, Tracked, refine, turned_to_meet
+from recon.look.rig import LEAST_FRAMES, KnownRig, RefinedRig, Tracked, refine
 from recon.look.sample import (
     QUICK,
     THOROUGH,
@@ -39,7 +41,10 @@ from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor, StereoSettings
 from recon.stereo.rectify.features import match_features
-from recon.stereo.rectify.rectifier import Rectifier
+from recon.stereo.rectify.rectifier import Rectifier, turns_of
+from recon.stereo.rectify.row_alignment import correct_rig
+
+_MATCHED_ROWS_PX: Final = 0.3  # rms row error that does not spoil matching
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +167,10 @@ def _rows_met(
             alignment = align_features(features, rectifier.camera)
         if alignment is not None:
             break
-    return turned_to_meet(rig, alignment, config.rectification)
+    if alignment is None or alignment.rms_px <= _MATCHED_ROWS_PX:
+        return rig, np.zeros(len(TURN))
+    R_left = turns_of(rig, config.rectification).R_left
+    return correct_rig(rig, alignment.turn, R_left), alignment.turn
 
 
 def _read(

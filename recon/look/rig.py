@@ -31,14 +31,12 @@ from recon.sources.source import StereoSource
 from recon.stereo.frame import StereoSettings
 from recon.stereo.rectify.lens import project_raw
 from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
-from recon.stereo.rectify.row_alignment import RowAlignment, as_raw, correct_rig
+from recon.stereo.rectify.row_alignment import as_raw
 
 MIN_WINDOWS: Final = 6  # fewer windows do not show how much they contradict each other
 DEPTHS_M: Final = (10.0, 30.0)  # distances for which the depth error is stated
-_MATCHED_ROWS_PX: Final = 0.3  # rms row error that does not spoil matching
 _PASSES: Final = 2  # a rig that was far off is matched, and fitted, once more
 _FAR_OFF_PX: Final = 1.0  # what features moved by, root mean square, if it was
-_FEATURES: Final = 800  # per image, to align rows by
 _LEAST_PX: Final = 0.05  # no matcher sees less; images are not warped for it
 _FIELD: Final = (16, 8)  # places across and down the image at which rigs are compared
 MOST_DEPTH_PERCENT: Final = 2.0
@@ -380,12 +378,3 @@ def compare_rigs(
     fields = (disparity_px - seen_px, left[:, 1] - right[:, 1])
     off_px, rows_px = (field.reshape(_FIELD[::-1]) for field in fields)
     return RigChange(depth_m, off_px, rows_px)
-
-
-def turned_to_meet(
-    rig: Rig, alignment: RowAlignment | None, settings: RectificationSettings
-) -> tuple[Rig, Float64]:
-    """Return a rig whose rows meet well enough to be matched, and what turned its right camera."""
-    if alignment is None or alignment.rms_px <= _MATCHED_ROWS_PX:
-        return rig, np.zeros(len(TURN))
-    return correct_rig(rig, alignment.turn, turns_of(rig, settings).R_left), alignment.turn

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -77,9 +77,9 @@ def fit_imu(
         T_stated: From its axes to those of the rectified left camera (4, 4), as files say; None =
             they do not.
     """
-    covered = _coverage(record, stamps_s)
-    notes = (*record.notes, *covered.notes, *doubt_forces(record))
-    if not covered.motions:
+    motions, gaps = _coverage(record, stamps_s)
+    notes = (*record.notes, *gaps, *doubt_forces(record))
+    if not motions:
         return FittedImu(None, notes)
     runs = see()
     turns = _turns_of(runs, record)
@@ -115,26 +115,20 @@ def _unused(why: str, got: str, notes: tuple[str, ...]) -> FittedImu:
     return FittedImu(None, (*notes, f"IMU not used: {why} ({got})"))
 
 
-class _Coverage(NamedTuple):
-    """How many motions between frames a record covers, and what the user should know of it."""
-
-    motions: int
-    notes: tuple[str, ...]
-
-
-def _coverage(record: ImuRecord, stamps_s: Float64) -> _Coverage:
+def _coverage(record: ImuRecord, stamps_s: Float64) -> tuple[int, tuple[str, ...]]:
+    """Return how many motions between frames a record covers, and what the user should know."""
     gyro, times_s = Gyro(record, np.eye(3), np.zeros(3)), stamps_s.tolist()
     known = [gyro.knows(*ends) for ends in pairwise(times_s)]
     if all(known):
-        return _Coverage(len(known), ())
+        return len(known), ()
     spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (record.timestamps_s, stamps_s)]
     if not any(known):
         what = f"IMU not used: it measured from {spans[0]}, the frames are from {spans[1]}"
-        return _Coverage(0, (f"{what}; both must use the same clock",))
+        return 0, (f"{what}; both must use the same clock",)
     gap_s = float(np.diff(record.timestamps_s).max())
     motions = f"{known.count(False)} of {counted(len(known), 'motion')} between frames"
     note = f"IMU: {motions} are not covered (it measured from {spans[0]}, the longest gap is "
-    return _Coverage(known.count(True), (f"{note}{gap_s:.2g} s)",))
+    return known.count(True), (f"{note}{gap_s:.2g} s)",)
 
 
 @dataclass(frozen=True, eq=False)

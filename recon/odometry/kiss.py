@@ -54,7 +54,7 @@ class KissOdometry:
         # Points of the map are half a voxel apart. What is off by more is another place.
         self._threshold_m = 0.5 * voxel_m
         still = _STILL * max_range_m / _RANGE
-        self._icp = KissIcp(KissIcpOptions(_BEYOND * max_range_m, voxel_m, convergence=still))
+        self._icp = KissIcp(_BEYOND * max_range_m, voxel_m, convergence=still)
         self._T_world_camera = self._T_visual = np.eye(4)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -99,16 +99,6 @@ class KissOdometry:
 _POINTS_PER_VOXEL: Final = 20  # most points that a voxel of the map keeps
 
 
-@dataclass(frozen=True)
-class KissIcpOptions:
-    """What users of kiss-icp choose."""
-
-    max_range_m: float  # points farther from the sensor are dropped, and the map is clipped there
-    voxel_m: float  # voxel size of the map
-    iterations: int = 500  # maximum number of ICP iterations
-    convergence: float = _STILL  # step length below which ICP has converged
-
-
 @dataclass(frozen=True, eq=False)
 class IcpAlignment:
     """Result of ICP for one frame."""
@@ -122,11 +112,33 @@ class KissIcp:
 
     Points are in OpenCV's camera axes, poses are those of the camera. It runs in one thread, so
     that sums have a fixed order and equal input gives equal output.
+
+    Args:
+        max_range_m: Points farther from the sensor are dropped, and the map is clipped there.
+        voxel_m: Edge of a voxel of the map.
+        iterations: Of ICP, at most.
+        convergence: Length of a step that is the last.
     """
 
-    def __init__(self, options: KissIcpOptions) -> None:
+    def __init__(
+        self,
+        max_range_m: float,
+        voxel_m: float,
+        *,
+        iterations: int = 500,
+        convergence: float = _STILL,
+    ) -> None:
+        # `model_construct` ignores environment variables.
+        config = KISSConfig.model_construct(
+            out_dir="",
+            data=DataConfig(max_range=max_range_m, min_range=0.0, deskew=False),
+            registration=RegistrationConfig(
+                max_num_iterations=iterations, convergence_criterion=convergence, max_num_threads=1
+            ),
+            mapping=MappingConfig(voxel_size=voxel_m, max_points_per_voxel=_POINTS_PER_VOXEL),
+        )
         with _our_errors():
-            self._icp = KissICP(_config(options))
+            self._icp = KissICP(config)
 
     def align(
         self,
@@ -172,20 +184,6 @@ class KissIcp:
     def points(self) -> Float64:
         """The points (M, 3) of the map, of which an equal one can be made."""
         return np.array(self._icp.local_map.point_cloud(), np.float64).reshape(-1, 3)
-
-
-def _config(options: KissIcpOptions) -> KISSConfig:
-    """Its configuration; ``model_construct`` ignores environment variables."""
-    return KISSConfig.model_construct(
-        out_dir="",
-        data=DataConfig(max_range=options.max_range_m, min_range=0.0, deskew=False),
-        registration=RegistrationConfig(
-            max_num_iterations=options.iterations,
-            convergence_criterion=options.convergence,
-            max_num_threads=1,
-        ),
-        mapping=MappingConfig(voxel_size=options.voxel_m, max_points_per_voxel=_POINTS_PER_VOXEL),
-    )
 
 
 def _points(xyz: NDArray[np.floating]) -> Float64:
