@@ -22,7 +22,7 @@ from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.map.store.trees import loop_in
 from recon.odometry.health import segment_numbers
-from recon.places.loop import Loop
+from recon.places.places import Loop
 
 _AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
 _POSE: Final = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
