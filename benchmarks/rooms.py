@@ -23,7 +23,7 @@ from recon.core.geometry.alignment import fit_points
 from recon.core.values import StereoPair
 from recon.look.look import refine_rig
 from recon.map.drive.sequence import map_sequence
-from recon.places.loop import Loop
+from recon.places.places import Loop
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene
 

@@ -48,7 +48,7 @@ from recon.map.store.map_file import MAP_FILE
 from recon.odometry.health import ExpectedDrift, expected_drift, health_warnings
 from recon.odometry.prior import MotionPrior
 from recon.odometry.registry import check_odometry
-from recon.odometry.sfm.find import check_sfm
+from recon.odometry.sfm import check_sfm
 from recon.rig.audit import check_related
 from recon.run.directory import STARTED, RunDirectory, state_folder
 from recon.run.run import Run

@@ -12,9 +12,8 @@ from recon.core.text import counted, metres
 from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.look.look import Look
-from recon.look.measures import MIN_FEATURES, Gaps
 from recon.look.rig import LATER, MOST_TIME_OFFSET, MOVES, RefinedRig
-from recon.look.sample import BLANK_DN, Sample
+from recon.look.sample import BLANK_DN, MIN_FEATURES, Gaps, Sample
 from recon.look.settings import AuditedSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MatchingSettings, settings_of
@@ -107,9 +106,7 @@ def find_faults(look: Look, config: AuditedSettings) -> list[Finding]:
         *_of_series(sample, look.gaps),
         *_of_geometry(look),
         *_of_rig(look.rig, look.geometry.disparity_px),
-        *_of_range(
-            look.geometry.disparity_px, _reach_px(look.camera, config.matching), look.camera
-        ),
+        *_of_range(look.geometry.disparity_px, config.matching, camera),
         *_of_calibration(sample, rig, camera, config.audit.baseline_m),
     ]
     findings = []
@@ -199,16 +196,18 @@ def _of_rig(rig: RefinedRig, disparity_px: Float64) -> Found:
         yield "stabilised", {"found": MOVES}
     if not rig.changes or not len(disparity_px):
         return
-    working_m = (
-        rig.camera.focal_px * rig.camera.baseline_m / max(float(np.median(disparity_px)), 1.0)
-    )
+    middle_px = max(float(np.median(disparity_px)), 1.0)
+    working_m = rig.camera.focal_px * rig.camera.baseline_m / middle_px
     if rig.wrong_at(working_m):
         yield "rig", {"shown": rig.describe(working_m)}
 
 
-def _of_range(disparity_px: Float64, reach_px: int | None, camera: RectifiedCamera) -> Found:
+def _of_range(disparity_px: Float64, matching: MatchingSettings, camera: RectifiedCamera) -> Found:
     if len(disparity_px) < MIN_FEATURES:
         return
+    own, reach_px = settings_of(matching.matcher, matching), None
+    if isinstance(own, SearchSettings) and not (own.ndisp is None and camera.ndisp is None):
+        reach_px = own.min_disparity_px + own.ndisp_for(camera)  # else the range adapts to pairs
     scale = camera.focal_px * camera.baseline_m
     # A matcher's disparity is in image columns, without doffs.
     columns_px = disparity_px - camera.doffs_px
@@ -246,11 +245,3 @@ def _centres(rig: Rig) -> list[tuple[str, tuple[float, float], tuple[int, int]]]
         (name, (float(c.matrix[0, 2]), float(c.matrix[1, 2])), (c.width_px, c.height_px))
         for name, c in zip(_SIDES, (rig.left, rig.right), strict=True)
     ]
-
-
-def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
-    """Return the largest disparity that is searched; None if the range adapts to each pair."""
-    own = settings_of(matching.matcher, matching)
-    if not isinstance(own, SearchSettings) or (own.ndisp is None and camera.ndisp is None):
-        return None
-    return own.min_disparity_px + own.ndisp_for(camera)

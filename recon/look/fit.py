@@ -1,6 +1,11 @@
 """The fault of a rig with which disparities fit the motion, and rows meet.
 
 Bundle adjustment of a few windows that share the fault; poses and points are eliminated.
+
+The formal error of a path takes features as independent. What is left of the fault of a rig is not:
+all that is on one side of the image, near, or low is off alike. So each window is adjusted twice,
+with what lies on either side, above and below, near and far: estimates of one motion that share no
+feature. Half of their difference is what the two together may be off by.
 """
 
 from __future__ import annotations
@@ -18,11 +23,11 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
 from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.look.fault import Places, RigFault, shrink
-from recon.look.halves import disagreement, middles
 from recon.look.tracks import StereoTracks, turns
 from recon.odometry.kernels import bundle
 from recon.odometry.pose import (
     CAUCHY_SIGMAS,
+    MIN_INLIERS,
     SIGMA_D_PX,
     SIGMA_UV_PX,
     TrackWindow,
@@ -357,12 +362,15 @@ def _of_rows(places: Places) -> tuple[Float64, Float64]:
 
 def _of_places(window: TrackWindow, places: Places, camera: RectifiedCamera) -> _Shared:
     T_camera_world = invert(window.T_world_camera)
-    residual, weight = _weighted(window, camera)
+    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
+    # Residuals in sigmas, 0 where unseen, and the weights of `adjust`.
+    residual = np.nan_to_num(reprojection(window, camera) / sigmas)
+    square = np.square(residual).sum(axis=2)
+    weight = window.seen / (1.0 + square / CAUCHY_SIGMAS**2)
     frames, points = weight.shape
     xyz = np.stack([apply(T, window.xyz_world) for T in T_camera_world])
     by_place = _derivative(xyz, camera)
     by = [places.by_left, (places.by_left - places.by_right)[:, :, :1]]
-    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
     # A correction moves what is observed, a step what is predicted: hence the sign.
     J = -np.nan_to_num(np.concatenate(by, axis=2)) / sigmas[:, None]
     # What has no disparity has no residual and no derivative of one.
@@ -390,9 +398,38 @@ def _derivative(xyz: Float64, camera: RectifiedCamera) -> Float64:
     return np.stack([np.stack(row, -1) for row in rows], axis=-2)
 
 
-def _weighted(window: TrackWindow, camera: RectifiedCamera) -> tuple[Float64, Float64]:
-    """Residuals (W, N, 3) in sigmas, 0 where unseen, and weights of `adjust` (W, N)."""
-    sigmas = np.array([SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX])
-    residual = np.nan_to_num(reprojection(window, camera) / sigmas)
-    square = np.square(residual).sum(axis=2)
-    return residual, window.seen / (1.0 + square / CAUCHY_SIGMAS**2)
+def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> float:
+    """Return the standard deviation of a path's length by halves of the features, as a share.
+
+    That of the halves that disagree most: what is near is low, too, so that theirs do not add up.
+    ``windows`` are seen with the rig of the path; those with too few features to be halved do not
+    count. NaN = there are no others.
+    """
+
+    def measured(window: TrackWindow) -> list[float]:
+        every = np.ones(len(window.xyz_world), np.bool_)
+        # The left, the upper and the farther points.
+        halves = [one < np.median(one) for one in middles(window).T] if every.any() else []
+        if min((int(half.sum()) for half in halves), default=0) < MIN_INLIERS:
+            return []
+        lengths_m = [[_length_m(window, part, camera) for part in (half, ~half)] for half in halves]
+        return [_length_m(window, every, camera), *(one - other for one, other in lengths_m)]
+
+    with serial_algebra():
+        found = [one for one in side_by_side(measured, windows, threads=FEW) if one]
+    if not found:
+        return float("nan")
+    length_m, *apart_m = np.sum(found, axis=0)
+    return 0.5 * float(np.abs(apart_m).max() / length_m)
+
+
+def middles(window: TrackWindow) -> Float64:
+    """Return where points are in the middle of their tracks: column, row, disparity (N, 3)."""
+    return np.asarray(np.nansum(window.uvd, axis=0) / np.isfinite(window.uvd).sum(axis=0).clip(1))
+
+
+def _length_m(window: TrackWindow, chosen: Bool, camera: RectifiedCamera) -> float:
+    """Return how far the camera moved through a window, by some of its points."""
+    part = TrackWindow(window.T_world_camera, window.uvd[:, chosen], window.xyz_world[chosen])
+    first, last = adjust(part, camera).T_world_camera[[0, -1]]
+    return float(np.linalg.norm((invert(first) @ last)[:3, 3]))

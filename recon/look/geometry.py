@@ -10,8 +10,7 @@ import numpy as np
 
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Float64
-from recon.look.measures import LARGEST_SKEW, MIN_FEATURES, align_features, time_skew
-from recon.look.sample import Sample, Shifted
+from recon.look.sample import LARGEST_SKEW, MIN_FEATURES, Sample, Shifted, align_features, time_skew
 from recon.stereo.rectify.epipolar import EpipolarAlignment, align_epipolar
 from recon.stereo.rectify.features import PairFeatures, inspect_features, pool_features
 
@@ -52,27 +51,23 @@ def measure_geometry(sample: Sample, camera: RectifiedCamera) -> Geometry:
     if offset:
         features, skew = pool_features(one.features for one in by_offset[offset]), None
         alignment = align_features(features, camera)
+    disparity_px = np.zeros(0)
+    if alignment is not None:
+        rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
+        shift = features.left_uv[:, 0] - features.right_uv[:, 0] + camera.doffs_px
+        aligned = np.abs(rows) < max(1.0, 3 * alignment.residual_px)
+        disparity_px = shift[aligned].astype(np.float64)
     return Geometry(
         pairs=len(each),
         features=features,
         matched=matched,
         alignment=alignment,
-        disparity_px=_disparities(features, alignment, camera),
+        disparity_px=disparity_px,
         swapped_ratio=inspect_features(features, camera.doffs_px, MIN_FEATURES).negative_ratio,
         out_of_step=bool(offset) or _best_fit(by_offset)[1] > _OFFSET_FACTOR,
         offset=offset,
         skew=skew,
     )
-
-
-def _disparities(
-    features: PairFeatures, alignment: EpipolarAlignment | None, camera: RectifiedCamera
-) -> Float64:
-    if alignment is None:
-        return np.zeros(0)
-    rows = alignment.turned_rows(features.right_uv, camera) - features.left_uv[:, 1]
-    shift = features.left_uv[:, 0] - features.right_uv[:, 0] + camera.doffs_px
-    return shift[np.abs(rows) < max(1.0, 3 * alignment.residual_px)].astype(np.float64)
 
 
 def _best_offset(
@@ -164,9 +159,9 @@ def measure_rigidity(
         seen = one.features
         aligned = align_epipolar(seen.left_uv, seen.right_uv, camera)
         if aligned is not None and 2 * aligned.agreeing > len(seen):
-            right = (
-                seen.right_uv[:, 1] if common is None else common.turned_rows(seen.right_uv, camera)
-            )
+            right = seen.right_uv[:, 1]
+            if common is not None:
+                right = common.turned_rows(seen.right_uv, camera)
             left_px = float(np.median(right - seen.left_uv[:, 1]))
             found[one.index] = (aligned.mean_px, left_px)
     epipolar_error_px, apart_px = np.array([*found.values()]).reshape(-1, 2).T

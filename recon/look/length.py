@@ -109,15 +109,10 @@ def see_baseline(
         lengths = [length for length in beside if length is not None]
     else:
         common, lengths = 0.0, [_between(source, config, measured, rig_ratio)]
-    return _compared(np.array(lengths), common) if lengths else None
-
-
-def _compared(lengths: Float64, common: float) -> SeenBaseline:
-    """Return the baseline by lengths (N, 4): seen, measured, their standard deviation, the rig's.
-
-    The last is common to all of them, as is ``common``, a share.
-    """
-    seen_m, known_m, sigma_m, rig_m = lengths.T
+    if not lengths:
+        return None
+    # What the rig is the reason of is common to all lengths, as is what wheels are off by.
+    seen_m, known_m, sigma_m, rig_m = np.array(lengths).T
     longer, weight = known_m / seen_m - 1.0, (seen_m / sigma_m) ** 2
     mean = float(weight @ longer / weight.sum())
     scatter = float(weight @ (longer - mean) ** 2) / max(len(longer) - 1, 1)
@@ -168,7 +163,7 @@ def _seen(
 def _between(
     source: StereoSource, config: StereoSettings, known: KnownLength, rig_ratio: float | None
 ) -> Float64:
-    """Return what `_compared` takes of the distance between two frames."""
+    """Return the distance between two frames: seen, measured, its standard deviation, the rig's."""
     first, last, length_m = known
     seen = _seen(source, config, first, last + 1, rig_ratio)
     if seen is None or seen.length_m <= 2.0 * seen.sigma_m:

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
+from typing import Final
 
 import numpy as np
 
@@ -19,40 +20,44 @@ from recon.core.text import counted
 from recon.core.values import Recorded, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.work import FEW, serial_algebra, side_by_side
+from recon.look.fault import TURN
 from recon.look.geometry import Geometry, measure_geometry, measure_rigidity
-from recon.look.measures import Gaps, align_features, find_gaps
-from recon.look.rig import LEAST_FRAMES, KnownRig, RefinedRig, Tracked, refine, turned_to_meet
-from recon.look.sample import QUICK, THOROUGH, Extent, Sample, Sampler, Window, choose, plan_windows
+from recon.look.rig import LEAST_FRAMES, KnownRig, RefinedRig, Tracked, refine
+from recon.look.sample import (
+    QUICK,
+    THOROUGH,
+    Extent,
+    Gaps,
+    Sample,
+    Sampler,
+    Window,
+    align_features,
+    choose,
+    find_gaps,
+    plan_windows,
+)
 from recon.look.tracks import StereoTracks, Tracking
 from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor, StereoSettings
+from recon.stereo.rectify.epipolar import correct_rig
 from recon.stereo.rectify.features import match_features
-from recon.stereo.rectify.rectifier import Rectifier
+from recon.stereo.rectify.rectifier import Rectifier, turns_of
+
+_MATCHED_ROWS_PX: Final = 0.3  # rms epipolar error that does not spoil matching
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What a drive shows in windows of frames from all over it.
+    """What a drive shows in windows of frames from all over it."""
 
-    Attributes:
-        source: The drive; of one whose cameras are whole frames apart, as its images belong
-            together.
-        camera: Its rectified views, by the calibration given.
-        sample: What was measured in single pairs.
-        geometry: What all features show together.
-        rig: The rig as given, and as the motion shows it.
-        gaps: Frames that are missing, by their timestamps.
-        shifted: By how many frames right images were taken later than they were paired.
-    """
-
-    source: StereoSource
-    camera: RectifiedCamera
-    sample: Sample
-    geometry: Geometry
-    rig: RefinedRig
-    gaps: Gaps
-    shifted: int = 0
+    source: StereoSource  # with cameras that are whole frames apart, as images belong together
+    camera: RectifiedCamera  # its rectified views, by the calibration given
+    sample: Sample  # what was measured in single pairs
+    geometry: Geometry  # what all features show together
+    rig: RefinedRig  # as given, and as the motion shows it
+    gaps: Gaps  # frames that are missing, by their timestamps
+    shifted: int = 0  # by how many frames right images were taken later than they were paired
 
     @property
     def recorded(self) -> Sequence[Recorded]:
@@ -136,16 +141,12 @@ def _looked(
     if windows and source.stereo and len(source) >= LEAST_FRAMES:
         used, turn = _rows_met(source, used, config, windows)
         tracking = FrameReconstructor(used, config)
-    how = _Reading(rectifier, tracking, extent, shared=used is given)
-    sample, tracks = _read(source, windows, how)
+    sample, tracks = _read(source, windows, rectifier, tracking, extent, shared=used is given)
     geometry = measure_geometry(sample, rectifier.camera)
     rigidity = measure_rigidity(sample, rectifier.camera, geometry.alignment)
     found = replace(begun, rigidity=rigidity)
     if tracking is not None and sample.broken is None and not found.not_rigid:
-
-        def again(other: Rig) -> list[StereoTracks]:
-            return _track(source, windows, FrameReconstructor(other, config))
-
+        again = partial(_track_again, source, windows, config)
         found = refine(found, Tracked(tracks, used, turn, again), config, known)
         if not rig.refine:
             found = replace(found, calibration=given)
@@ -168,34 +169,37 @@ def _rows_met(
             alignment = align_features(features, rectifier.camera)
         if alignment is not None:
             break
-    return turned_to_meet(rig, alignment, config.rectification)
-
-
-@dataclass(frozen=True, eq=False)
-class _Reading:
-    """How windows are read."""
-
-    rectifier: Rectifier  # by the calibration given
-    tracking: FrameReconstructor | None  # with the rig that is to be refined
-    extent: Extent
-    shared: bool  # whether both rectify alike
+    if alignment is None or alignment.rms_px <= _MATCHED_ROWS_PX:
+        return rig, np.zeros(len(TURN))
+    R_left = turns_of(rig, config.rectification).R_left
+    return correct_rig(rig, alignment.turn, R_left), alignment.turn
 
 
 def _read(
-    source: StereoSource, windows: Sequence[Window], how: _Reading
+    source: StereoSource,
+    windows: Sequence[Window],
+    rectifier: Rectifier,
+    reconstructor: FrameReconstructor | None,
+    extent: Extent,
+    *,
+    shared: bool,
 ) -> tuple[Sample, list[StereoTracks]]:
-    """Read windows, side by side in threads: measure their pairs, and track features."""
-    chosen = choose(windows, how.extent)
+    """Read windows, side by side in threads: measure their pairs, and track features.
+
+    ``rectifier`` is by the calibration given, ``reconstructor`` with the rig that is to be refined;
+    ``shared`` = both rectify alike.
+    """
+    chosen = choose(windows, extent)
 
     def read(window: Window) -> tuple[Sample, list[StereoTracks]]:
-        sampler = Sampler(window, how.rectifier, how.extent, chosen)
-        tracking = None if how.tracking is None else Tracking(how.tracking)
+        sampler = Sampler(window, rectifier, extent, chosen)
+        tracking = None if reconstructor is None else Tracking(reconstructor)
         try:
             for number, pair in _pairs(source, window.start, window.stop):
                 view = None
                 if tracking is not None and window.tracked[0] <= number < window.tracked[1]:
                     view = tracking.add(pair)
-                sampler.add(number, pair, view if how.shared else None)
+                sampler.add(number, pair, view if shared else None)
         except ReconError as error:
             sampler.sample.broken = error
         return sampler.sample, [] if tracking is None else tracking.found
@@ -207,10 +211,11 @@ def _read(
     return sample, [one for _, tracks in parts for one in tracks]
 
 
-def _track(
-    source: StereoSource, windows: Sequence[Window], reconstructor: FrameReconstructor
+def _track_again(
+    source: StereoSource, windows: Sequence[Window], config: StereoSettings, rig: Rig
 ) -> list[StereoTracks]:
     """Track features through the same windows with another rig."""
+    reconstructor = FrameReconstructor(rig, config)
 
     def track(window: Window) -> list[StereoTracks]:
         tracking = Tracking(reconstructor)

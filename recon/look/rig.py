@@ -29,19 +29,14 @@ from recon.look.tracks import FRAMES, StereoTracks
 from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource
 from recon.stereo.frame import StereoSettings
-from recon.stereo.rectify.epipolar import EpipolarAlignment, as_raw, correct_rig
+from recon.stereo.rectify.epipolar import as_raw
 from recon.stereo.rectify.lens import project_raw
-from recon.stereo.rectify.rectifier import (
-    RectificationSettings,
-    turns_of,
-)
+from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
 
 MIN_WINDOWS: Final = 6  # fewer windows do not show how much they contradict each other
 DEPTHS_M: Final = (10.0, 30.0)  # distances for which the depth error is stated
-_MATCHED_ROWS_PX: Final = 0.3  # rms epipolar error that does not spoil matching
 _PASSES: Final = 2  # a rig that was far off is matched, and fitted, once more
 _FAR_OFF_PX: Final = 1.0  # what features moved by, root mean square, if it was
-_FEATURES: Final = 800  # per image, to align rows by
 _LEAST_PX: Final = 0.05  # no matcher sees less; images are not warped for it
 _FIELD: Final = (16, 8)  # places across and down the image at which rigs are compared
 MOST_DEPTH_PERCENT: Final = 2.0
@@ -327,10 +322,7 @@ def refine(
     fitted = replace(fitted, values=values)
     described = _described(begun.given, refined, fitted, config.rectification)
     return replace(
-        described,
-        begun_with=begun.begun_with,
-        period_s=begun.period_s,
-        rigidity=begun.rigidity,
+        described, begun_with=begun.begun_with, period_s=begun.period_s, rigidity=begun.rigidity
     )
 
 
@@ -352,7 +344,13 @@ def _described(
     camera = turns_of(given, settings).camera
     changes = tuple(compare_rigs(given, refined, z, settings) for z in DEPTHS_M)
     rig = refined if changes[-1].moved_px > _LEAST_PX else given
-    return RefinedRig(given, rig, camera, fitted, changes, _mean_sigma(camera, fitted))
+    # How the mean disparity follows the parameters of the fault.
+    uv = spread_pixels(camera, _FIELD)
+    right_uv, none = uv + np.array([camera.doffs_px, 0.0]), np.zeros(len(fitted.values))
+    places = RigFault(camera).correct(uv, right_uv, none)
+    by = (places.by_left - places.by_right)[..., 0, :].reshape(-1, len(none)).mean(axis=0)
+    sigma_px = float(np.sqrt(by @ fitted.covariance @ by))
+    return RefinedRig(given, rig, camera, fitted, changes, sigma_px)
 
 
 def compare_rigs(
@@ -382,21 +380,3 @@ def compare_rigs(
     fields = (disparity_px - seen_px, left[:, 1] - right[:, 1])
     off_px, epipolar_error_px = (field.reshape(_FIELD[::-1]) for field in fields)
     return RigChange(depth_m, off_px, epipolar_error_px)
-
-
-def turned_to_meet(
-    rig: Rig, alignment: EpipolarAlignment | None, settings: RectificationSettings
-) -> tuple[Rig, Float64]:
-    """Return a rig whose rows meet well enough to be matched, and what turned its right camera."""
-    if alignment is None or alignment.rms_px <= _MATCHED_ROWS_PX:
-        return rig, np.zeros(len(TURN))
-    return correct_rig(rig, alignment.turn, turns_of(rig, settings).R_left), alignment.turn
-
-
-def _mean_sigma(camera: RectifiedCamera, fitted: FittedFault) -> float:
-    """Return the standard deviation of the mean disparity that the fault explains."""
-    uv = spread_pixels(camera, _FIELD)
-    right_uv = uv + np.array([camera.doffs_px, 0.0])
-    places = RigFault(camera).correct(uv, right_uv, np.zeros(len(fitted.values)))
-    by = (places.by_left - places.by_right)[..., 0, :].reshape(-1, len(fitted.values)).mean(axis=0)
-    return float(np.sqrt(by @ fitted.covariance @ by))

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.values import Recorded, Rectified, RectifiedCamera
+from recon.core.values import Recorded, Rectified
 from recon.core.values.arrays import Float64
 from recon.look.fault import RigFault
 from recon.odometry.features import find_in_right, surface_slopes
@@ -67,8 +67,12 @@ class StereoTracker:
         if len(self._recent) < FRAMES:
             return None
         frames, self._recent = self._recent, []
-        window = _often_seen(self._odometry.window)
-        if len(window.T_world_camera) < _MIN_FRAMES or not _moves(window, frame.pair.camera):
+        window = self._odometry.window
+        often = window.seen.sum(axis=0) >= _LEAST_SEEN
+        window = TrackWindow(window.T_world_camera, window.uvd[:, often], window.xyz_world[often])
+        first, last = window.T_world_camera[[0, -1], :3, 3]
+        still = np.linalg.norm(last - first) < _LEAST_MOTION * frame.pair.camera.baseline_m
+        if len(window.T_world_camera) < _MIN_FRAMES or still:
             return None
         return StereoTracks(window, _in_right(window, frames))
 
@@ -120,16 +124,6 @@ class LiveTracks:
         window = self._tracker.add(frame, found)
         if window is not None:
             self._segments[-1].append(window)
-
-
-def _moves(window: TrackWindow, camera: RectifiedCamera) -> bool:
-    first, last = window.T_world_camera[[0, -1], :3, 3]
-    return bool(np.linalg.norm(last - first) >= _LEAST_MOTION * camera.baseline_m)
-
-
-def _often_seen(window: TrackWindow) -> TrackWindow:
-    often = window.seen.sum(axis=0) >= _LEAST_SEEN
-    return TrackWindow(window.T_world_camera, window.uvd[:, often], window.xyz_world[often])
 
 
 def _in_right(window: TrackWindow, frames: Sequence[OdometryFrame]) -> Float64:

@@ -19,13 +19,7 @@ from recon.core.text import counted
 from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, Int64, UInt8, tree_of
 from recon.core.values.camera import depth_from_disparity, project, unproject
-from recon.odometry.protocol import (
-    Odometry,
-    OdometryFrame,
-    OdometryHealth,
-    OdometryResult,
-    pose_in,
-)
+from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult, pose_in
 
 _MAX_SIGMA_M: Final = 0.05  # largest standard deviation of a trusted motion on a road
 _MAX_SIGMA_RATIO: Final = 0.05  # fraction of the motion's length that is added to it
@@ -33,61 +27,43 @@ _MIN_TELLING: Final = 8  # with fewer usable patches the images say nothing
 MIN_RATIO: Final = 0.6  # least fraction of patches that must agree with a trusted motion
 
 
-@dataclass(frozen=True, eq=False)
-class CheckedState:
-    """What is kept from frame to frame."""
-
-    sight: Sight  # the last frame
-    T_world_camera: Float64  # (4, 4), its pose
-
-
 class CheckedOdometry:
     """Checks how certain every motion is, and whether the image agrees with it.
 
-    Poses stay as they are; ``health.ok`` and its notes say which are not to be trusted.
-
-    Args:
-        odometry: Finds the poses.
-        scale: Size of the scene against a road.
+    Poses stay as they are; ``health.ok`` and its notes say which are not to be trusted. ``scale``
+    is the size of the scene against a road.
     """
 
     def __init__(self, odometry: Odometry, scale: float = 1.0) -> None:
         self.odometry, self._scale = odometry, scale
-        self._state: CheckedState | None = None
+        self._last: tuple[Sight, Float64] | None = None  # the last frame, and its pose
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
-        result, state = self.odometry.register(frame), self._state
-        if state is None and not result.health.ok:
+        result, last = self.odometry.register(frame), self._last
+        if last is None and not result.health.ok:
             return result
         sight = Sight(frame.pair.left, frame.disparity)
-        self._state = CheckedState(sight, result.T_world_camera)
-        if state is None or not result.health.ok or result.health.begins:
+        self._last = sight, result.T_world_camera
+        if last is None or not result.health.ok or result.health.begins:
             return result
-        T_before_now = invert(state.T_world_camera) @ result.T_world_camera
-        views = (state.sight, sight)
-        doubts = self._doubts(result.health, views, T_before_now, frame.pair.camera)
+        T_before_now = invert(last[1]) @ result.T_world_camera
+        doubts = self._doubts(result.health, (last[0], sight), T_before_now, frame.pair.camera)
         notes = (*result.health.notes, *doubts)
         return replace(result, health=replace(result.health, ok=not doubts, notes=notes))
 
     def state(self) -> dict[str, Any]:
-        last = self._state
-        if last is None:
-            return {"odometry": self.odometry.state(), "last": None}
-        return {
-            "odometry": self.odometry.state(),
-            "last": {
-                "left": last.sight.left,
-                "disparity": tree_of(last.sight.disparity),
-                "T_world_camera": last.T_world_camera,
-            },
-        }
+        last = None
+        if self._last is not None:
+            sight, T = self._last
+            last = {"left": sight.left, "disparity": tree_of(sight.disparity), "T_world_camera": T}
+        return {"odometry": self.odometry.state(), "last": last}
 
     def restore(self, state: dict[str, Any]) -> None:
         self.odometry.restore(state["odometry"])
-        last, self._state = state["last"], None
+        last, self._last = state["last"], None
         if last is not None:
             sight = Sight(last["left"], Disparity(**last["disparity"]))
-            self._state = CheckedState(sight, pose_in(last, "T_world_camera"))
+            self._last = sight, pose_in(last, "T_world_camera")
 
     def _doubts(
         self,
@@ -101,12 +77,14 @@ class CheckedOdometry:
         if health.sigma_m > most_sigma_m(length_m, self._scale):
             return [f"the motion is known to {health.sigma_m:.2g} m only"]
         found = explain_motion(*views, T_before_now, camera)
+        patches = counted(found.informative, "patch", "patches")
         if found.informative >= _MIN_TELLING:
-            return _contradiction(found.ratio, found.informative)
+            if found.ratio >= MIN_RATIO:
+                return []
+            return [f"only {100 * found.ratio:.0f} % of {patches} of the image moved like that"]
         # A visual motion has passed the test of its uncertainty; any other has no other evidence.
         if np.isfinite(health.sigma_m):
             return []
-        patches = counted(found.informative, "patch", "patches")
         return [f"only {patches} of the image can distinguish motions"]
 
 
@@ -114,13 +92,6 @@ def most_sigma_m(length_m: float, scale: float) -> float:
     """Return the largest standard deviation of a trusted motion of that length."""
     # Among near things steps are long, and loops hold the path: there it may be more.
     return min(1.0, 2.5 * scale) * _MAX_SIGMA_M + _MAX_SIGMA_RATIO * length_m
-
-
-def _contradiction(ratio: float, informative: int) -> list[str]:
-    if ratio >= MIN_RATIO:
-        return []
-    patches = counted(informative, "patch", "patches")
-    return [f"only {100 * ratio:.0f} % of {patches} of the image moved like that"]
 
 
 _LEAST_NOISE: Final = 0.5  # grey values: rounding alone leaves 0.3
@@ -147,7 +118,7 @@ class Sight:
     """What the check needs of a frame."""
 
     left: UInt8  # (H, W)
-    disparity: Disparity  # its disparity
+    disparity: Disparity
 
     @cached_property
     def noise(self) -> float:
@@ -166,10 +137,7 @@ class _Samples:
 
 
 def explain_motion(
-    before: Sight,
-    now: Sight,
-    T_before_now: Float64,
-    camera: RectifiedCamera,
+    before: Sight, now: Sight, T_before_now: Float64, camera: RectifiedCamera
 ) -> Agreement:
     """Count the patches of the last image that match where a motion takes them in this one.
 
@@ -208,12 +176,7 @@ def noise_sigma(grey: UInt8) -> float:
     return max(float(np.median(np.abs(mixed))) / (6.0 * 0.6745), _LEAST_NOISE)
 
 
-def _sample(
-    before: Sight,
-    left: UInt8,
-    T_before_now: Float64,
-    camera: RectifiedCamera,
-) -> _Samples:
+def _sample(before: Sight, left: UInt8, T_before_now: Float64, camera: RectifiedCamera) -> _Samples:
     """Every n-th pixel with a disparity that stays in the image."""
     step, (height, width) = _STRIDE_PX, left.shape
     # Slopes need a neighbour on either side.
@@ -228,11 +191,9 @@ def _sample(
     grey = before.left.astype(np.int16)
     right, down = (grey[row, column + 1], grey[row + 1, column])
     slope = np.stack([right - grey[row, column - 1], down - grey[row - 1, column]], axis=1)
-    patch = (row // _PATCH_PX) * -(-width // _PATCH_PX)
-    patch += column // _PATCH_PX
-    return _Samples(
-        patch, grey[row, column].astype(np.float64), _interpolated(left, u, v), 0.5 * slope
-    )
+    patch = (row // _PATCH_PX) * -(-width // _PATCH_PX) + column // _PATCH_PX
+    values = grey[row, column].astype(np.float64)
+    return _Samples(patch, values, _interpolated(left, u, v), 0.5 * slope)
 
 
 def _interpolated(image: UInt8, u: Float64, v: Float64) -> Float64:

@@ -18,8 +18,7 @@ from recon.core.geometry.se3 import Motion, apply, invert
 from recon.core.values import Disparity, Rectified, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8
 from recon.core.values.camera import depth_from_disparity, project, unproject
-from recon.odometry.kernels.patches import Placing, place_patches
-from recon.odometry.kernels.slopes import Surface, fit_slopes
+from recon.odometry.kernels.patches import Placing, Surface, fit_slopes, place_patches
 from recon.odometry.pose import REPROJECTION_PX, TrackWindow
 from recon.odometry.protocol import OdometryFrame
 from recon.stereo.match.sad import halve
@@ -81,7 +80,7 @@ def observe_points(
 
 def known_disparity(disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
     """Return the disparity (N,) of features; NaN = unknown, or too small to give a depth."""
-    d = sample_disparity(disparity, uv).astype(np.float64)
+    d = _sampled(disparity, uv).astype(np.float64)
     return np.where(d + camera.doffs_px < MIN_DISPARITY_PX, np.nan, d)
 
 
@@ -133,10 +132,13 @@ def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tupl
     """
     if not len(uv):
         return uv.copy(), np.zeros(0, np.bool_)
+    ours, theirs = (np.ravel(cv2.meanStdDev(image)) for image in (source, target))
+    if (np.abs(theirs - ours) > _MAX_EXPOSURE_CHANGE * ours).any():
+        target = exposed_as(source, target)
     end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.05)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         source,
-        _comparable(source, target),
+        target,
         uv.reshape(-1, 1, 2),
         guess_uv.reshape(-1, 1, 2).copy(),
         winSize=(_WINDOW_PX, _WINDOW_PX),
@@ -151,14 +153,7 @@ def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tupl
     return there, np.asarray(found & inside)
 
 
-def _comparable(source: UInt8, target: UInt8) -> UInt8:
-    """The target, adapted to the exposure of the source if the two differ."""
-    ours, theirs = (np.ravel(cv2.meanStdDev(image)) for image in (source, target))
-    same = np.abs(theirs - ours) <= _MAX_EXPOSURE_CHANGE * ours
-    return target if same.all() else exposed_as(source, target)
-
-
-def sample_disparity(disparity: Disparity, uv: Float32) -> Float32:
+def _sampled(disparity: Disparity, uv: Float32) -> Float32:
     """The median (N,) of the disparities around features; NaN = none, or inconsistent.
 
     Tracking features into the right image instead gave two to four times the drift on real drives,
@@ -197,12 +192,19 @@ def find_corners(
     Ref: Shi and Tomasi, "Good features to track", CVPR 1994.
     """
     score = cv2.cornerMinEigenVal(grey, _BLOCK_PX, ksize=3)
+    size = 2 * _DISTANCE_PX + 1
+    peak = score >= cv2.dilate(score, np.ones((size, size), np.uint8))
+    peak &= (score > _MIN_SCORE) & _free(grey.shape, taken_uv)
+    inside = np.zeros_like(peak)
+    inside[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = True
     # Over a whole image, `nonzero` takes six times as long.
-    v, u = np.divmod(np.flatnonzero(_peaks(score) & _free(grey.shape, taken_uv)), grey.shape[1])
+    v, u = np.divmod(np.flatnonzero(peak & inside), grey.shape[1])
     cells = _cell_of(np.stack([u, v], axis=1), grey.shape, cell_px)
     order = np.lexsort((u, v, -score[v, u], cells))
     rank = _rank_in_group(cells[order])
-    missing = per_cell - _count_per_cell(taken_uv, grey.shape, cell_px)
+    count = -(-grey.shape[0] // cell_px) * -(-grey.shape[1] // cell_px)
+    taken = np.bincount(_cell_of(taken_uv, grey.shape, cell_px), minlength=count)
+    missing = per_cell - taken
     keep = order[rank < missing[cells[order]]]
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32)
 
@@ -227,18 +229,7 @@ def find_fewer_corners(grey: UInt8, taken_uv: Float32) -> Float32:
     """
     taken = (0.5 * (taken_uv - np.float32(0.5))).astype(np.float32)
     cells = {"cell_px": _CELL_PX * 3 // 5, "per_cell": _PER_CELL - 1}
-    uv: Float32 = 2 * find_corners(halve(grey), taken, **cells) + np.float32(0.5)
-    return uv
-
-
-def _peaks(score: Float32) -> Bool:
-    """Local maxima of the score that are good enough and away from the border."""
-    size = 2 * _DISTANCE_PX + 1
-    peak = score >= cv2.dilate(score, np.ones((size, size), np.uint8))
-    peak &= score > _MIN_SCORE
-    inside = np.zeros_like(peak)
-    inside[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = True
-    return np.asarray(peak & inside)
+    return np.asarray(2 * find_corners(halve(grey), taken, **cells) + np.float32(0.5))
 
 
 def _free(shape: tuple[int, ...], taken_uv: Float32) -> Bool:
@@ -255,11 +246,6 @@ def _cell_of(uv: NDArray[np.generic], shape: tuple[int, ...], size: int) -> NDAr
     v = np.clip(np.rint(uv[:, 1]).astype(np.int64), 0, shape[0] - 1)
     cell: NDArray[np.int64] = (v // size) * columns + u // size
     return cell
-
-
-def _count_per_cell(uv: Float32, shape: tuple[int, ...], size: int) -> NDArray[np.int64]:
-    cells = -(-shape[0] // size) * -(-shape[1] // size)
-    return np.bincount(_cell_of(uv, shape, size), minlength=cells)
 
 
 def _rank_in_group(groups: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -16,6 +16,10 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.odometry.pose import REPROJECTION_PX, KnownPose, LocatedCamera
 
+MAX_SIGMAS: Final = 4.7
+"""Two measures of one motion that differ by more standard deviations of their difference contradict
+each other: 0.1 % of right ones do, with six degrees of freedom."""
+
 MIN_HELD: Final = 8
 """Fewer tracks that agree on a translation give no pose. Two fix it; that six more of a hundred
 wrong ones, each with a chance of 1 %, agree with one of some hundred translations, happens once in
@@ -83,7 +87,14 @@ class Guided:
         limit_px = REPROJECTION_PX + _SIGMAS * np.deg2rad(self.sigma_deg) * camera.focal_px
         limit = limit_px / camera.focal_px
         pairs = np.random.default_rng(0).integers(0, len(uv), (_PAIRS, 2))
-        A, b = _equations(turned, rays)
+        # A point ``p + t`` is seen along (x, y, 1) where ``(p + t)_x = x (p + t)_z``, and so for y.
+        # Errors of what is near are as large in the image as those of what is far.
+        depth = np.maximum(turned[:, 2], 1e-3)
+        J = np.zeros((len(turned), 2, 3))
+        J[:, 0, 0] = J[:, 1, 1] = 1.0
+        J[:, :, 2] = -rays
+        J, off = J / depth[:, None, None], (rays * turned[:, 2:] - turned[:, :2]) / depth[:, None]
+        A, b = np.einsum("nki,nkj->nij", J, J), np.einsum("nki,nk->ni", J, off)
         tried = _solved(A[pairs].sum(axis=1), b[pairs].sum(axis=1))
         agree = max((_near(turned, rays, t, limit) for t in tried), key=np.count_nonzero)
         for _ in range(_ROUNDS):
@@ -93,20 +104,6 @@ class Guided:
             return None
         R = self.T_world_camera[:3, :3]
         return LocatedCamera(make_transform(R, -R @ moved), agree)
-
-
-def _equations(turned: Float64, rays: Float64) -> tuple[Float64, Float64]:
-    """Return the normal equations (N, 3, 3), (N, 3) of each point for the translation.
-
-    A point ``p + t`` is seen along (x, y, 1) where ``(p + t)_x = x (p + t)_z``, and so for y.
-    """
-    J = np.zeros((len(turned), 2, 3))
-    J[:, 0, 0] = J[:, 1, 1] = 1.0
-    J[:, :, 2] = -rays
-    off = rays * turned[:, 2:] - turned[:, :2]
-    # Errors of what is near are as large in the image as those of what is far.
-    J, off = (x / np.maximum(turned[:, 2], 1e-3).reshape(-1, *[1] * (x.ndim - 1)) for x in (J, off))
-    return np.einsum("nki,nkj->nij", J, J), np.einsum("nki,nk->ni", J, off)
 
 
 def _solved(A: Float64, b: Float64) -> Float64:

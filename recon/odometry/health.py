@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.core.text import counted, metres
 from recon.core.values import RectifiedCamera, Trajectory
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool
 from recon.odometry.checked import SegmentCounter
 from recon.odometry.protocol import OdometryHealth
 
@@ -40,10 +40,8 @@ def doubt_about(health: Sequence[OdometryHealth]) -> list[str]:
         return [f"PATH AND MAP ARE NOT TO BE TRUSTED: {poses}"]
     if not bad:
         return []
-    poses = (
-        f"{len(bad)} of {counted(len(health), 'pose')} are not to be trusted ({name_frames(bad)})"
-    )
-    return [f"{poses}: nothing of them is in the map"]
+    poses = f"{len(bad)} of {counted(len(health), 'pose')} are not to be trusted"
+    return [f"{poses} ({name_frames(bad)}): nothing of them is in the map"]
 
 
 def name_frames(indices: Sequence[int]) -> str:
@@ -54,20 +52,17 @@ def name_frames(indices: Sequence[int]) -> str:
 
 def health_warnings(health: Sequence[OdometryHealth]) -> list[str]:
     """One line per distinct warning, and per segment of frames without a trusted pose."""
-    texts = dict.fromkeys(line for record in health for line in record.warnings)
-    lines = [f"{_named(health, line)}: {line}" for line in texts]
+    about: dict[str, list[int]] = {}
+    for index, record in enumerate(health):
+        for line in record.warnings:
+            about.setdefault(line, []).append(index)
+    lines = [f"{_frames(of[0], of[-1])}: {line}" for line, of in about.items()]
     bad = [index for index, record in enumerate(health) if not record.ok]
     for first, last in _segments(bad):
         why = "; ".join(dict.fromkeys(health[first].notes)) or "no reason recorded"
         where = _frames(first, last)
         lines.append(f"{where}: the pose is not to be trusted, nothing of it is mapped ({why})")
     return [*(doubt_about(health) if len(bad) > _MANY * len(health) else ()), *lines]
-
-
-def _named(health: Sequence[OdometryHealth], line: str) -> str:
-    """The range of frames that a warning is about, first to last."""
-    about = [index for index, record in enumerate(health) if line in record.warnings]
-    return _frames(about[0], about[-1])
 
 
 def _frames(first: int, last: int) -> str:
@@ -136,38 +131,27 @@ def expected_drift(
     trusted pose do not count: `health_warnings` names them.
     """
     steps_m = np.linalg.norm(np.diff(path.positions_m, axis=0), axis=1)
-    figures = np.array([(h.scale_px, h.sigma_m, h.sigma_deg) for h in health[1:]])
-    known = np.isfinite(figures).all(axis=1) if len(figures) else np.zeros(0, np.bool_)
-    known &= np.array([h.ok for h in health[1:]], dtype=np.bool_)
+    stated = [(h.scale_px, h.sigma_m, h.sigma_deg) for h in health[1:]]
+    figures = np.array(stated).reshape(-1, 3)
+    known = np.isfinite(figures).all(axis=1) & trusted_poses(health[1:])
     length_m = float(steps_m[known].sum())
     if not length_m > 0.0:
         return None
     scale_px, sigma_m, sigma_deg = figures[known].T
     if rig_ratio is None:
-        rig_ratio = float(steps_m[known] @ _scale_ratio(scale_px, camera) / length_m)
+        # An error of all disparities, also by the yaw, is a fraction of each.
+        off_px = np.hypot(RIG_DISPARITY_PX, camera.focal_px * np.deg2rad(RIG_YAW_DEG))
+        rig_ratio = float(steps_m[known] @ (off_px / scale_px) / length_m)
     rig = float(np.hypot(rig_ratio, RIG_BASELINE))
-    step_m = length_m / float(known.sum())
-    random = _random_ratio(step_m, length_m, sigma_m, np.deg2rad(sigma_deg))
+    # Errors of single steps: translations add up as they are; a turn moves all that follows, on
+    # average a third of its square.
+    segment_m = min(_SEGMENT_M, length_m)
+    steps = segment_m / (length_m / float(known.sum()))
+    moved = np.mean(sigma_m**2) + np.mean(np.deg2rad(sigma_deg) ** 2) * segment_m**2 / 3.0
+    random = float(np.sqrt(steps * moved) / segment_m)
     rests_on_px = length_m / float(steps_m[known] @ (1.0 / scale_px))
     return ExpectedDrift(
         percent=100.0 * float(np.hypot(rig, random)),
         rig_percent=100.0 * rig,
         rests_on_m=camera.focal_px * camera.baseline_m / rests_on_px,
     )
-
-
-def _scale_ratio(scale_px: Float64, camera: RectifiedCamera) -> Float64:
-    """What an error of all disparities does to the lengths (N,) of steps, as a share."""
-    yaw_px = camera.focal_px * np.deg2rad(RIG_YAW_DEG)
-    return np.asarray(np.hypot(RIG_DISPARITY_PX, yaw_px) / scale_px)
-
-
-def _random_ratio(step_m: float, length_m: float, sigma_m: Float64, sigma_rad: Float64) -> float:
-    """What errors of single steps add up to over a segment, as a fraction of its length.
-
-    Translations add as they are; a turn moves all that follows, on average a third of its square.
-    """
-    segment_m = min(_SEGMENT_M, length_m)
-    steps = segment_m / step_m
-    moved = np.mean(sigma_m**2) + np.mean(sigma_rad**2) * segment_m**2 / 3.0
-    return float(np.sqrt(steps * moved) / segment_m)

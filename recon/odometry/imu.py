@@ -7,17 +7,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import islice
 from typing import Any, Final
 
 import numpy as np
 
 from recon.core.geometry.se3 import Motion, hat, make_transform
-from recon.core.values import ImuRecord
+from recon.core.values import ImuRecord, Trajectory
 from recon.core.values.arrays import Float64
-from recon.odometry.guide import Guided
-from recon.odometry.imu_runs import ImuSpan
+from recon.core.work import FEW, serial_algebra, side_by_side
+from recon.odometry.guide import MAX_SIGMAS, Guided
+from recon.odometry.protocol import OdometryFrame, OdometryResult
+from recon.odometry.visual import VisualOdometry
+from recon.sources.source import StereoSource
+from recon.stereo.frame import FrameReconstructor
 
-_SIGMAS: Final = 4.7
 _MOST_STEPS: Final = 5.0  # usual steps between two samples; over a longer gap nothing is known
 
 
@@ -159,11 +163,8 @@ def find_up(gyro: Gyro, run: ImuSpan, arm_m: Float64) -> tuple[Float64 | None, f
     path, begin_s = run.path, float(run.path.timestamps_s[0])
     near = path.timestamps_s <= begin_s + _UP_SPAN_S
     ends_s = path.timestamps_s[near] - begin_s
-    if (
-        near.sum() < 4
-        or ends_s[-1] < _LEAST_SPAN_S
-        or not gyro.knows(begin_s, begin_s + ends_s[-1])
-    ):
+    short = near.sum() < 4 or ends_s[-1] < _LEAST_SPAN_S
+    if short or not gyro.knows(begin_s, begin_s + ends_s[-1]):
         return None, float("nan")
     times_s, speed = _integrated(gyro, begin_s, float(ends_s[-1]))
     fallen_m = _summed(speed, times_s)
@@ -178,7 +179,7 @@ def find_up(gyro: Gyro, run: ImuSpan, arm_m: Float64) -> tuple[Float64 | None, f
     covariance = np.linalg.inv((weight[:, None] * A).T @ (weight[:, None] * A))
     gravity, sigma = found[1], float(np.hypot(np.sqrt(covariance[1, 1]), _FORCE))
     sigma_deg = float(np.rad2deg(sigma / _G))
-    wrong = abs(float(np.linalg.norm(gravity)) - _G) > _SIGMAS * sigma
+    wrong = abs(float(np.linalg.norm(gravity)) - _G) > MAX_SIGMAS * sigma
     if wrong or sigma_deg > _MOST_UP_DEG:
         return None, sigma_deg
     return -gravity / np.linalg.norm(gravity), sigma_deg
@@ -232,3 +233,47 @@ def _summed(values: Float64, times_s: Float64) -> Float64:
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(times_s)[:, None]
     summed[1:] = np.cumsum(steps, axis=0)
     return summed
+
+
+_FIRST_FRAMES: Final = 24  # frames from the first on, by which up is found
+_SEEN_PARTS: Final = 4  # more parts, up to the end of the drive
+_FRAMES: Final = 12  # frames of each
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSpan:
+    """Poses of consecutive frames whose motions are trusted, and how well these are known."""
+
+    path: Trajectory
+    sigma_m: Float64  # (N - 1,), of each motion
+    sigma_rad: Float64  # (N - 1,)
+
+
+def seen_runs(source: StereoSource, reconstructor: FrameReconstructor) -> list[ImuSpan]:
+    """Return runs from all over a drive, in order."""
+
+    def seen(part: tuple[int, int]) -> list[ImuSpan]:
+        odometry, runs = VisualOdometry(), [list[tuple[float, OdometryResult]]()]
+        for pair in islice(source.frames(part[0]), part[1]):
+            frame = OdometryFrame(*reconstructor.match_roughly(pair))
+            found = odometry.register(frame)
+            if found.health.begins or not found.health.ok:
+                runs.append([])
+            if found.health.ok:
+                runs[-1].append((frame.pair.timestamp_s, found))
+        return [_run(run) for run in runs if len(run) > 1]
+
+    rest = np.linspace(
+        _FIRST_FRAMES, max(_FIRST_FRAMES, len(source) - _FRAMES), _SEEN_PARTS
+    ).astype(int)
+    parts = [(0, _FIRST_FRAMES), *((int(start), _FRAMES) for start in np.unique(rest))]
+    with serial_algebra():
+        return [run for runs in side_by_side(seen, parts, threads=FEW) for run in runs]
+
+
+def _run(found: list[tuple[float, OdometryResult]]) -> ImuSpan:
+    path = Trajectory(
+        np.stack([result.T_world_camera for _, result in found]), np.array([t for t, _ in found])
+    )
+    sigmas = np.array([(r.health.sigma_m, np.deg2rad(r.health.sigma_deg)) for _, r in found[1:]])
+    return ImuSpan(path, *sigmas.T)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -20,9 +20,16 @@ from recon.core.geometry.se3 import angle_rad, distance_in_sigmas, log_so3
 from recon.core.text import counted
 from recon.core.values import ImuRecord
 from recon.core.values.arrays import Float64
-from recon.odometry.imu import Gyro, ImuGuide, accelerations, doubt_forces, find_up, turns_after
-from recon.odometry.imu_runs import ImuSpan
-from recon.odometry.prior import MAX_SIGMAS
+from recon.odometry.guide import MAX_SIGMAS
+from recon.odometry.imu import (
+    Gyro,
+    ImuGuide,
+    ImuSpan,
+    accelerations,
+    doubt_forces,
+    find_up,
+    turns_after,
+)
 
 _LAGS_S: Final = np.linspace(-0.5, 0.5, 101)  # delays that are tried first
 _ROUNDS: Final = 15  # steps of the fit
@@ -72,9 +79,9 @@ def fit_imu(
         T_stated: From its axes to those of the rectified left camera (4, 4), as files say; None =
             they do not.
     """
-    covered = _coverage(record, stamps_s)
-    notes = (*record.notes, *covered.notes, *doubt_forces(record))
-    if not covered.motions:
+    motions, gaps = _coverage(record, stamps_s)
+    notes = (*record.notes, *gaps, *doubt_forces(record))
+    if not motions:
         return FittedImu(None, notes)
     runs = see()
     turns = _turns_of(runs, record)
@@ -110,26 +117,20 @@ def _unused(why: str, got: str, notes: tuple[str, ...]) -> FittedImu:
     return FittedImu(None, (*notes, f"IMU not used: {why} ({got})"))
 
 
-class _Coverage(NamedTuple):
-    """How many motions between frames a record covers, and what the user should know of it."""
-
-    motions: int
-    notes: tuple[str, ...]
-
-
-def _coverage(record: ImuRecord, stamps_s: Float64) -> _Coverage:
+def _coverage(record: ImuRecord, stamps_s: Float64) -> tuple[int, tuple[str, ...]]:
+    """Return how many motions between frames a record covers, and what the user should know."""
     gyro, times_s = Gyro(record, np.eye(3), np.zeros(3)), stamps_s.tolist()
     known = [gyro.knows(*ends) for ends in pairwise(times_s)]
     if all(known):
-        return _Coverage(len(known), ())
+        return len(known), ()
     spans = [f"{t[0]:.3f} to {t[-1]:.3f} s" for t in (record.timestamps_s, stamps_s)]
     if not any(known):
         what = f"IMU not used: it measured from {spans[0]}, the frames are from {spans[1]}"
-        return _Coverage(0, (f"{what}; both must use the same clock",))
+        return 0, (f"{what}; both must use the same clock",)
     gap_s = float(np.diff(record.timestamps_s).max())
     motions = f"{known.count(False)} of {counted(len(known), 'motion')} between frames"
     note = f"IMU: {motions} are not covered (it measured from {spans[0]}, the longest gap is "
-    return _Coverage(known.count(True), (f"{note}{gap_s:.2g} s)",))
+    return known.count(True), (f"{note}{gap_s:.2g} s)",)
 
 
 @dataclass(frozen=True, eq=False)

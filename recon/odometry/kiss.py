@@ -18,7 +18,7 @@ from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import invert, orthonormalise
 from recon.core.text import counted
 from recon.core.values import Disparity, PointCloud
-from recon.core.values.arrays import Bool, Float32, Float64, UInt8
+from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.core.values.camera import depth_from_disparity, depth_sigma, unproject
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.odometry.visual import VisualOdometry
@@ -54,7 +54,7 @@ class KissOdometry:
         # Points of the map are half a voxel apart. What is off by more is another place.
         self._threshold_m = 0.5 * voxel_m
         still = _STILL * max_range_m / _RANGE
-        self._icp = KissIcp(KissIcpOptions(_BEYOND * max_range_m, voxel_m, convergence=still))
+        self._icp = KissIcp(_BEYOND * max_range_m, voxel_m, convergence=still)
         self._T_world_camera = self._T_visual = np.eye(4)
 
     def register(self, frame: OdometryFrame) -> OdometryResult:
@@ -99,16 +99,6 @@ class KissOdometry:
 _POINTS_PER_VOXEL: Final = 20  # most points that a voxel of the map keeps
 
 
-@dataclass(frozen=True)
-class KissIcpOptions:
-    """What users of kiss-icp choose."""
-
-    max_range_m: float  # points farther from the sensor are dropped, and the map is clipped there
-    voxel_m: float  # voxel size of the map
-    iterations: int = 500  # maximum number of ICP iterations
-    convergence: float = _STILL  # step length below which ICP has converged
-
-
 @dataclass(frozen=True, eq=False)
 class IcpAlignment:
     """Result of ICP for one frame."""
@@ -122,11 +112,33 @@ class KissIcp:
 
     Points are in OpenCV's camera axes, poses are those of the camera. It runs in one thread, so
     that sums have a fixed order and equal input gives equal output.
+
+    Args:
+        max_range_m: Points farther from the sensor are dropped, and the map is clipped there.
+        voxel_m: Edge of a voxel of the map.
+        iterations: Of ICP, at most.
+        convergence: Length of a step that is the last.
     """
 
-    def __init__(self, options: KissIcpOptions) -> None:
+    def __init__(
+        self,
+        max_range_m: float,
+        voxel_m: float,
+        *,
+        iterations: int = 500,
+        convergence: float = _STILL,
+    ) -> None:
+        # `model_construct` ignores environment variables.
+        config = KISSConfig.model_construct(
+            out_dir="",
+            data=DataConfig(max_range=max_range_m, min_range=0.0, deskew=False),
+            registration=RegistrationConfig(
+                max_num_iterations=iterations, convergence_criterion=convergence, max_num_threads=1
+            ),
+            mapping=MappingConfig(voxel_size=voxel_m, max_points_per_voxel=_POINTS_PER_VOXEL),
+        )
         with _our_errors():
-            self._icp = KissICP(_config(options))
+            self._icp = KissICP(config)
 
     def align(
         self,
@@ -172,20 +184,6 @@ class KissIcp:
     def points(self) -> Float64:
         """The points (M, 3) of the map, of which an equal one can be made."""
         return np.array(self._icp.local_map.point_cloud(), np.float64).reshape(-1, 3)
-
-
-def _config(options: KissIcpOptions) -> KISSConfig:
-    """Its configuration; ``model_construct`` ignores environment variables."""
-    return KISSConfig.model_construct(
-        out_dir="",
-        data=DataConfig(max_range=options.max_range_m, min_range=0.0, deskew=False),
-        registration=RegistrationConfig(
-            max_num_iterations=options.iterations,
-            convergence_criterion=options.convergence,
-            max_num_threads=1,
-        ),
-        mapping=MappingConfig(voxel_size=options.voxel_m, max_points_per_voxel=_POINTS_PER_VOXEL),
-    )
 
 
 def _points(xyz: NDArray[np.floating]) -> Float64:
@@ -236,7 +234,9 @@ def select_points(frame: OdometryFrame, max_range_m: float, beyond: float = 1.0)
         good &= sigma <= beyond * max_range_m / _RANGE
     good &= textured(frame.pair.left, _MIN_GRADIENT)
     good &= consistent(frame.disparity, _MAX_DISPARITY_STEP_PX)
-    return _cloud(frame, depth, sigma, good)
+    v, u = np.nonzero(good)
+    xyz = unproject(u, v, depth[good], camera)
+    return PointCloud(xyz=xyz, sigma_m=sigma[good], frame="camera")
 
 
 def textured(grey: UInt8, min_gradient: float) -> Bool:
@@ -252,9 +252,3 @@ def consistent(disparity: Disparity, max_step_px: float) -> Bool:
     """
     values = np.where(disparity.valid, disparity.values, np.float32(-1e6)).astype(np.float32)
     return np.asarray(disparity.valid & (np.abs(cv2.medianBlur(values, 5) - values) <= max_step_px))
-
-
-def _cloud(frame: OdometryFrame, depth: Float32, sigma: Float32, where: Bool) -> PointCloud:
-    v, u = np.nonzero(where)
-    xyz = unproject(u, v, depth[where], frame.pair.camera)
-    return PointCloud(xyz=xyz, sigma_m=sigma[where], frame="camera")

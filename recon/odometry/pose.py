@@ -235,8 +235,7 @@ def reprojection(window: TrackWindow, camera: RectifiedCamera) -> Float64:
 def misfits(window: TrackWindow, camera: RectifiedCamera) -> Bool:
     """Points (N,) whose newest observation is an outlier."""
     residual = np.nan_to_num(reprojection(window, camera)[-1])
-    sigmas = [SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX]
-    square = np.square(residual / np.array(sigmas)).sum(axis=1)
+    square = np.square(residual / [SIGMA_UV_PX, SIGMA_UV_PX, SIGMA_D_PX]).sum(axis=1)
     return np.asarray(square > _MAX_SIGMAS**2)
 
 
@@ -378,21 +377,15 @@ def newest_health(
     fits_px = max(reprojection_px, _BEST_PX) / _MEDIAN
     information = newest_information(window, camera, fits_px, known)
     sigma = np.sqrt(np.diag(covariance_of(information)))
+    disparity = window.uvd[-1, :, 2]
+    d = disparity[np.isfinite(disparity)] + camera.doffs_px
     return OdometryHealth(
         tracks=tracks,
         inliers=int(newest.sum()),
         reprojection_px=reprojection_px,
         sigma_m=float(np.linalg.norm(sigma[:3])),
         sigma_deg=float(np.rad2deg(np.linalg.norm(sigma[3:]))),
-        scale_px=_scale_px(window.uvd[-1, :, 2], camera),
+        # A disparity gives a fraction of the depth: a feature counts by the square of its own.
+        scale_px=float(d @ d / d.sum()) if len(d) else float("nan"),
         notes=(note,) if note else (),
     )
-
-
-def _scale_px(disparity: Float64, camera: RectifiedCamera) -> float:
-    """The disparity that fixes the length of a motion, from those (N,) of the features.
-
-    A disparity gives a fraction of the depth, so a feature counts as much as the square of its own.
-    """
-    d = disparity[np.isfinite(disparity)] + camera.doffs_px
-    return float(d @ d / d.sum()) if len(d) else float("nan")

@@ -1,19 +1,20 @@
-"""The odometries by name."""
+"""The odometries by name, and those that are not ours, whose poses and states are checked."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
 
-from recon.core.errors import RegistrationError, SettingsError
-from recon.core.geometry.se3 import invert
-from recon.core.plugins import name_of
+from recon.core.errors import FormatError, RegistrationError, SettingsError
+from recon.core.geometry.se3 import check_rigid, invert, orthonormalise
+from recon.core.plugins import Plugins, calling, kind_of, name_of
 from recon.core.text import counted
 from recon.core.values import Trajectory
+from recon.core.values.arrays import Float64
 from recon.odometry.checked import CheckedOdometry
-from recon.odometry.foreign import PLUGINS, ForeignOdometry
 from recon.odometry.guide import Guide
 from recon.odometry.kiss import KissOdometry
 from recon.odometry.prior import MotionPrior
@@ -95,3 +96,75 @@ class KnownPoses:
 
     def restore(self, state: dict[str, Any]) -> None:
         self._T_first_world, self._begun = pose_in(state, "T_first_world"), bool(state["begun"])
+
+
+PLUGINS: Final = Plugins(
+    "odometry", "recon.odometries", ("register(frame)", "state()", "restore(state)")
+)
+_HEALTH: Final = TypeAdapter(OdometryHealth)
+_FIRST_M: Final = 1e-6  # rounding apart, the first pose is the identity
+_PLAIN: Final = (str, int, float, type(None))
+
+
+class ForeignOdometry:
+    """Checks what an odometry that is not ours returns."""
+
+    def __init__(self, odometry: Odometry, name: str) -> None:
+        self._odometry, self._where = odometry, f"odometry {name!r}"
+        self._begun = False
+
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        where = f"{self._where}, frame {frame.pair.index}"
+        found = self._call(self._odometry.register, frame, where=where)
+        if not isinstance(found, OdometryResult):
+            what, hint = "the odometry returns no pose", "return recon.OdometryResult(T)"
+            raise RegistrationError(what, where=where, got=kind_of(found), hint=hint)
+        T = self._pose(found.T_world_camera, where)
+        try:
+            health = _HEALTH.validate_python(vars(found.health))
+        except (ValidationError, TypeError) as error:
+            what, got = "the health of a pose is none", repr(found.health)
+            raise RegistrationError(what, where=where, got=got) from error
+        self._begun = True
+        return OdometryResult(T, health)
+
+    def state(self) -> dict[str, Any]:
+        own = self._call(self._odometry.state, where=self._where)
+        if not isinstance(own, Mapping) or not _storable(own):
+            what, got = "the state of the odometry cannot be stored", kind_of(own)
+            expected = "a dict of arrays, texts and numbers of Python, also in dicts and lists"
+            raise RegistrationError(what, where=self._where, got=got, expected=expected)
+        return {"own": dict(own), "begun": self._begun}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._call(self._odometry.restore, state["own"], where=self._where)
+        self._begun = bool(state["begun"])
+
+    def _call(self, method: Callable[..., Any], *given: Any, where: str) -> Any:
+        with calling(RegistrationError, "the odometry fails", where=where):
+            return method(*given)
+
+    def _pose(self, given: Any, where: str) -> Float64:
+        """Return a pose with an exact rotation."""
+        try:
+            T = np.array(given, dtype=np.float64)
+            check_rigid("the pose", T)
+        except (FormatError, ValueError, TypeError) as error:
+            what = "the odometry returns no rigid pose"
+            got = error.got if isinstance(error, FormatError) else kind_of(given)
+            expected = "float (4, 4): a rotation and metres, last row 0 0 0 1"
+            raise RegistrationError(what, where=where, got=got, expected=expected) from error
+        if not self._begun and np.abs(T - np.eye(4)).max() > _FIRST_M:
+            what, expected = "the first pose is not the identity", "T_first_camera"
+            raise RegistrationError(what, where=where, got=T.tolist(), expected=expected)
+        return orthonormalise(T)
+
+
+def _storable(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return all(isinstance(name, str) for name in value) and all(map(_storable, value.values()))
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "biuf"
+    if isinstance(value, list | tuple):
+        return all(map(_storable, value))
+    return isinstance(value, _PLAIN)

@@ -21,7 +21,7 @@ from recon.odometry.features import (
     points_of,
     replenish,
 )
-from recon.odometry.guide import Guide, Guided
+from recon.odometry.guide import MAX_SIGMAS, Guide, Guided
 from recon.odometry.pose import (
     MIN_INLIERS,
     KnownPose,
@@ -34,7 +34,6 @@ from recon.odometry.pose import (
     newest_health,
     newest_information,
 )
-from recon.odometry.prior import MAX_SIGMAS
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.stereo.rectify.features import match_features
 
@@ -99,9 +98,8 @@ class VisualOdometry:
         if guided is not None:
             motion = state.motion.moved(guided.T_world_camera, time_s)
         expected = guided or Guided(motion.T_world_camera, np.eye(6))
-        seen = self._by_tracking(state, frame, expected) or self._by_matching(
-            state, frame, expected
-        )
+        seen = self._by_tracking(state, frame, expected)
+        seen = seen or self._by_matching(state, frame, expected)
         if seen is None:
             return self._lost(state, frame, motion, guided)
         if self._contradicts(state, seen, frame):

@@ -4,6 +4,14 @@ A pose graph knows of a loop where its frames were measured to be, and of its ne
 odometry says. Here all keyframes agree at once on the points that they see: each is matched with
 those before it and with those of its loops, about 10 ms for each pair. All other frames follow by
 odometry, as between the nodes of a pose graph.
+
+To what the edges of the graph cost comes, of each sighting of a point, ``c² log(1 + r²/c²)``, with
+``r`` the difference of its column, row and disparity in standard deviations (Cauchy's loss). Their
+normal equations are those of the window of visual odometry (`recon.odometry.kernels.bundle`), node
+after node. The points are eliminated (Schur complement): what is left is sparse, since few nodes
+see the same points. A sighting takes about 1 kB.
+
+Ref: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 """
 
 from __future__ import annotations
@@ -11,20 +19,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Final, NamedTuple, Protocol
+from functools import cached_property, lru_cache
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
+from scipy.sparse import bsr_array, coo_array, csc_array
 from scipy.sparse.csgraph import connected_components
 
+from recon.core.geometry.alignment import Problem, minimise
 from recon.core.geometry.se3 import invert
 from recon.core.values import RectifiedCamera, Trajectory
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
+from recon.core.values.camera import project
+from recon.odometry.kernels import bundle
 from recon.odometry.pose import INDEPENDENCE
-from recon.places.align import CAUCHY_SIGMAS, SIGMA_D_PX
-from recon.places.bundle import Bundle, Sightings, State
 from recon.places.closure import (
     USUAL,
     Closure,
@@ -35,10 +44,10 @@ from recon.places.closure import (
     optimise_path,
 )
 from recon.places.detector import StoredKeyframe
-from recon.places.keyframe import feature_sigma_px
-from recon.places.loop import Loop
-from recon.places.pose_graph import PoseGraph, free_nodes
-from recon.places.verify import Matchable, match_near
+from recon.places.keyframe import feature_sigma_px, points_of
+from recon.places.places import Loop
+from recon.places.pose_graph import PoseGraph, free_nodes, solve_damped
+from recon.places.verify import CAUCHY_SIGMAS, SIGMA_D_PX, Matchable, match_near
 
 _BEFORE: Final = (1, 3)
 """By how many keyframes those are before each that it is matched with: the nearest, and one from
@@ -112,12 +121,13 @@ def adjust_path(
     before, after = test.fit(start), test.fit(T_world_node)
     if not test.cost(after) < test.cost(before):
         return None
+    # How far what is seen is from where it should be, in the image.
+    off_px = [np.hypot(*test.residuals_px(state)[:, :2].T) for state in (before, after)]
     return Adjustment(
         optimise_path(path, nodes, T_world_node),
         len(np.unique(known.seen.node)),
         known.seen.points,
-        _median_px(test, before),
-        _median_px(test, after),
+        *(float(np.nanmedian(off)) for off in off_px),
     )
 
 
@@ -229,7 +239,154 @@ def _tracks(pairs: Sequence[_Matches], nodes: NDArray[np.intp]) -> Sightings:
     return seen.of_points(np.arange(seen.points) % max(1, stride) == 0)
 
 
-def _median_px(bundle: Bundle, state: State) -> float:
-    """Return the median distance of what is seen from where it should be, in the image."""
-    off = bundle.residuals_px(state)
-    return float(np.nanmedian(np.hypot(off[:, 0], off[:, 1])))
+_ROUNDS: Final = 12
+_STILL: Final = 1e-4  # gain of a step, as a fraction of the cost, that is not worth another one
+_OF_MEDIAN: Final = 1.4826  # standard deviations of a normal error in a median absolute one
+_LEAST_PX: Final = 0.05  # however well features fit, they count as no better
+
+State: TypeAlias = tuple[Float64, Float64]
+"""Poses (N, 4, 4) of the nodes, and points (P, 3), in the world."""
+
+_OneFrame: TypeAlias = tuple[Float64, Float64, Float64]
+"""``T_camera_world``, what is seen, and points, as the kernel takes them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Where nodes see points: in order of the nodes, each of which sees a point once."""
+
+    node: NDArray[np.intp]  # (M,), ascending
+    point: NDArray[np.intp]  # (M,), every number below P at least once
+    uvd: Float64  # (M, 3), column, row, disparity
+
+    @property
+    def points(self) -> int:
+        """Number of points, P."""
+        return int(self.point.max(initial=-1)) + 1
+
+    def of_points(self, chosen: Bool) -> Sightings:
+        """Return those of some points (P,), numbered anew."""
+        kept, number = chosen[self.point], np.cumsum(chosen) - 1
+        return Sightings(self.node[kept], number[self.point[kept]], self.uvd[kept])
+
+
+class _Linear(NamedTuple):
+    """Normal equations: of the graph, nodes (N), points (P), and of both by sighting (M)."""
+
+    graph: tuple[Float64, Float64]
+    H_node: Float64  # (N, 6, 6)
+    g_node: Float64  # (N, 6)
+    H_point: Float64  # (P, 3, 3)
+    g_point: Float64  # (P, 3)
+    H_cross: Float64  # (M, 6, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """The nodes of a graph, what they see, and how well."""
+
+    graph: PoseGraph
+    seen: Sightings
+    camera: RectifiedCamera
+    sigma_px: tuple[float, float]  # standard deviations of columns and rows, and of disparities
+    cauchy_sigmas: float  # residual at which a sighting counts half
+
+    def fit(self, T_world_node: Float64) -> State:
+        """Fit the free nodes and all points, from poses."""
+        # Each point begins where the node that is nearest to it sees it.
+        order = np.lexsort((-self.seen.uvd[:, 2], self.seen.point))
+        rows = order[np.unique(self.seen.point[order], return_index=True)[1]]
+        T, xyz = T_world_node[self.seen.node[rows]], points_of(self.seen.uvd[rows], self.camera)
+        points = np.einsum("pij,pj->pi", T[:, :3, :3], xyz) + T[:, :3, 3]
+        problem = Problem(self.cost, self.linearise, self.step)
+        start = T_world_node, np.asarray(points)
+        return minimise(problem, start, rounds=_ROUNDS, min_gain=_STILL)
+
+    def residuals_px(self, state: State) -> Float64:
+        """Return predicted minus seen column, row, disparity (M, 3); NaN behind a camera."""
+        T = invert(state[0])[self.seen.node]
+        xyz = np.einsum("mij,mj->mi", T[:, :3, :3], state[1][self.seen.point]) + T[:, :3, 3]
+        return np.stack(project(xyz, self.camera), axis=1) - self.seen.uvd
+
+    def cost(self, state: State) -> float:
+        costs = (bundle.cost(*each, tuple(self._model)) for _, _, each in self._by_node(state))
+        return self.graph.cost(state[0]) + self.cauchy_sigmas**2 * sum(costs)
+
+    def linearise(self, state: State) -> _Linear:
+        """Return the normal equations; of gradients, half."""
+        nodes, points = len(state[0]), self.seen.points
+        found = _Linear(
+            self.graph.linearise(state[0]),
+            np.zeros((nodes, 6, 6)),
+            np.zeros((nodes, 6)),
+            np.zeros((points, 3, 3)),
+            np.zeros((points, 3)),
+            np.empty((len(self.seen.node), 6, 3)),
+        )
+        for node, rows, each in self._by_node(state):
+            normal, seen = bundle.linearise(*each, self._model), self.seen.point[rows]
+            found.H_node[node], found.g_node[node] = normal.H_pose[0], -normal.g_pose[0]
+            found.H_cross[rows] = normal.H_cross[0]
+            found.H_point[seen] += normal.H_point
+            found.g_point[seen] -= normal.g_point
+        return found
+
+    def step(self, state: State, linear: _Linear, damping: float) -> State | None:
+        """Return poses and points after a step; None where it has no solution."""
+        raised = linear.H_point * (1.0 + damping * np.eye(3)) + bundle.RIDGE * np.eye(3)
+        inverse = np.linalg.inv(raised)
+        moved, change = state[0], np.zeros((len(inverse), 3))
+        if self.graph.free.any():
+            cross = self._by_free_node(linear.H_cross)
+            folded = self._by_free_node(linear.H_cross @ inverse[self.seen.point])
+            matrix, right = self.graph.equations(linear.graph)
+            blocks = linear.H_node[self.graph.free]
+            places = np.arange(len(blocks) + 1)
+            diagonal = bsr_array((blocks, places[:-1], places), shape=(6 * len(blocks),) * 2)
+            matrix = csc_array(matrix + diagonal - folded @ cross.T)
+            right = right + linear.g_node[self.graph.free].ravel()
+            found = solve_damped(matrix, right - folded @ linear.g_point.ravel(), damping)
+            if found is None:
+                return None
+            moved, change = self.graph.moved(state[0], -found), (cross.T @ found).reshape(-1, 3)
+        steps = np.einsum("pij,pj->pi", inverse, change - linear.g_point)
+        return moved, state[1] + steps
+
+    def measured(self, state: State, ratio: float) -> Bundle:
+        """Return it with standard deviations as its residuals show them.
+
+        ``ratio`` is that of the sightings whose errors count as independent.
+        """
+        off = np.abs(self.residuals_px(state))
+        unknowns = 3 * self.seen.points + 6 * int(self.graph.free.sum())
+        more = np.sqrt(off.size / max(off.size - unknowns, 1) / ratio)
+        uv, d = (
+            max(_OF_MEDIAN * float(np.nanmedian(part)), _LEAST_PX) * float(more)
+            for part in (off[:, :2], off[:, 2])
+        )
+        return replace(self, sigma_px=(uv, d))
+
+    @cached_property
+    def _model(self) -> bundle.BundleModel:
+        camera, (sigma_uv, sigma_d) = self.camera, self.sigma_px
+        fb = camera.focal_px * camera.baseline_m
+        pinhole = camera.focal_px, camera.cx_px, camera.cy_px, fb, camera.doffs_px
+        return bundle.BundleModel(*pinhole, sigma_uv, sigma_d, self.cauchy_sigmas)
+
+    def _by_node(self, state: State) -> Iterator[tuple[int, slice, _OneFrame]]:
+        """Yield each node that sees anything, which sightings, and them as a window of a frame."""
+        T_node_world, xyz = invert(state[0]), state[1]
+        nodes, begins = np.unique(self.seen.node, return_index=True)
+        ends = [*begins[1:].tolist(), len(self.seen.node)]
+        for node, begin, end in zip(nodes.tolist(), begins.tolist(), ends, strict=True):
+            rows = slice(begin, end)
+            at, uvd = T_node_world[node : node + 1], self.seen.uvd[rows][None]
+            yield node, rows, (at, uvd, xyz[self.seen.point[rows]])
+
+    def _by_free_node(self, blocks: Float64) -> bsr_array:
+        """Return blocks (M, 6, 3) of sightings as a matrix, without the rows of fixed nodes."""
+        free = self.graph.free
+        kept, number = free[self.seen.node], np.cumsum(free) - 1
+        begins = np.searchsorted(number[self.seen.node[kept]], np.arange(free.sum() + 1))
+        shape = (6 * int(free.sum()), 3 * self.seen.points)
+        return bsr_array((blocks[kept], self.seen.point[kept], begins), shape=shape)

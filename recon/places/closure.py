@@ -18,10 +18,8 @@ from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.odometry.health import segment_numbers, trusted_poses
 from recon.odometry.protocol import OdometryHealth
-from recon.places.fixes import Held
-from recon.places.loop import MIN_AGREEING, Loop
-from recon.places.places import Drift, drift_over, path_lengths
-from recon.places.pose_graph import PoseEdge, optimise_poses
+from recon.places.places import MIN_AGREEING, Drift, Loop, drift_over, path_lengths
+from recon.places.pose_graph import Held, PoseEdge, optimise_poses
 
 _EASING: Final = 10.0  # factor by which the tolerance of loops falls from round to round
 _KEPT: Final = 0.25  # least weight of a loop that is believed
@@ -149,8 +147,7 @@ def join_drives(
 
     Ref: Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
-    constraints_of = [_constrained_frames(constraints, number) for number in range(len(drives))]
-    nodes = _spaced(drives, constraints_of)
+    nodes = _spaced(drives, constraints)
     begins = np.cumsum([0, *map(len, nodes)]).tolist()
     ratio = 1.0 if held is None else USUAL
     chains = [
@@ -159,8 +156,9 @@ def join_drives(
     ]
     edges = [_constraint_edge(constraint, drives, nodes, begins) for constraint in constraints]
     start = [d.trajectory.T_world_camera[own] for d, own in zip(drives, nodes, strict=True)]
+    # Segments are numbered so that no two drives have the same.
     parts = [
-        _numbered(d.segment[own], k) for k, (d, own) in enumerate(zip(drives, nodes, strict=True))
+        d.segment[own] + (k << 32) for k, (d, own) in enumerate(zip(drives, nodes, strict=True))
     ]
     root = longest_segment(drives[0].segment)
     begun = _beside(np.concatenate(start), np.concatenate(parts), root, constraints, edges)
@@ -169,8 +167,13 @@ def join_drives(
     try:
         if held is None:
             poses, weights = _solve(begun, steps, edges, anchor)
-        else:
-            poses, weights = _solve_held(drives, nodes, begun, steps, edges, held)
+        else:  # with the survey as one more node, which is free
+            paths = [drive.trajectory for drive in drives]
+            poses = np.concatenate([begun, held.T_world_survey[None]])
+            for _ in range(_HELD_ROUNDS):
+                fixed = held.edges(paths, nodes, poses)
+                poses, weights = _solve(poses, [*steps, *fixed], edges)
+            poses = poses[:-1]
     except RegistrationError:
         return None
     deformations = [np.mean([misfit(edge, poses) for edge in chain]) for chain in chains if chain]
@@ -180,8 +183,8 @@ def join_drives(
     ):
         return None
     solved = [poses[a:b] for a, b in pairwise(begins)]
-    paths = [optimise_path(*each) for each in zip(drives, nodes, solved, strict=True)]
-    return JoinedDrives(tuple(paths), kept)
+    bent = [optimise_path(*each) for each in zip(drives, nodes, solved, strict=True)]
+    return JoinedDrives(tuple(bent), kept)
 
 
 def loop_bias(loop: Loop, scale: float = 1.0) -> Drift:
@@ -205,24 +208,15 @@ def longest_segment(segment: NDArray[np.int64]) -> int:
     return int(np.bincount(segment + 1, minlength=2)[1:].argmax())
 
 
-def _numbered(segment: NDArray[np.int64], drive: int) -> NDArray[np.int64]:
-    """Return the segments (N,) of a drive, numbered so that no other drive has the same."""
-    return segment + (drive << 32)
-
-
-def _constrained_frames(constraints: Sequence[Constraint], drive: int) -> list[int]:
-    ends = (
-        (one, constraint.loop)
-        for constraint in constraints
-        for one in zip(constraint.drives, (0, 1), strict=True)
-    )
-    return sorted({(loop.first, loop.last)[end] for (number, end), loop in ends if number == drive})
-
-
 def _spaced(
-    drives: Sequence[DrivePath], constrained: Sequence[list[int]]
+    drives: Sequence[DrivePath], constraints: Sequence[Constraint]
 ) -> list[NDArray[np.intp]]:
     """Return the frames of each drive that are nodes: at even distances, and where constraints are."""
+    ends: list[set[int]] = [set() for _ in drives]
+    for constraint in constraints:
+        ends[constraint.drives[0]].add(constraint.loop.first)
+        ends[constraint.drives[1]].add(constraint.loop.last)
+    constrained = [sorted(frames) for frames in ends]
     length_m = sum(float(drive.path_m[-1]) for drive in drives)
     gap_m = max(min(drive.scale for drive in drives) * _NODE_M, 2.0 * length_m / _MAX_NODES)
     if 2 * sum(map(len, constrained)) > _MAX_NODES:
@@ -289,22 +283,6 @@ def _solve(
     return poses, weights[len(steps) :]
 
 
-def _solve_held(
-    drives: Sequence[DrivePath],
-    nodes: Sequence[NDArray[np.intp]],
-    start: Float64,
-    steps: list[PoseEdge],
-    constraints: list[PoseEdge],
-    held: Held,
-) -> tuple[Float64, Float64]:
-    """Return poses and weights as `_solve`, with the survey as one more node, which is free."""
-    paths = [drive.trajectory for drive in drives]
-    poses = np.concatenate([start, held.T_world_survey[None]])
-    for _ in range(_HELD_ROUNDS):
-        poses, weights = _solve(poses, [*steps, *held.edges(paths, nodes, poses)], constraints)
-    return poses[:-1], weights
-
-
 def odometry_edges(
     drive: DrivePath, nodes: NDArray[np.intp], begin: int, ratio: float
 ) -> list[PoseEdge]:
@@ -322,8 +300,8 @@ def odometry_edges(
         drift = drift_over(between_m, drive.scale)
         stated = np.repeat(drive.variance[last] - drive.variance[first], 3)
         T = invert(poses[first]) @ poses[last]
-        information = _inverse(ratio**2 * drift.covariance + np.diag(stated))
-        edges.append(PoseEdge(k, k + 1, T, information))
+        covariance = ratio**2 * drift.covariance + np.diag(stated)
+        edges.append(PoseEdge(k, k + 1, T, np.asarray(np.linalg.inv(covariance), np.float64)))
     return edges
 
 
@@ -344,7 +322,8 @@ def _constraint_edge(
     covariance = np.linalg.inv(turn.T @ loop.information @ turn) + more.covariance
     T = orthonormalise(to_first @ loop.T_first_last @ invert(to_last))
     ends = begins[one] + first, begins[other] + last
-    return PoseEdge(*ends, T, _inverse(covariance), doubtful=True)
+    information = np.asarray(np.linalg.inv(covariance), np.float64)
+    return PoseEdge(*ends, T, information, doubtful=True)
 
 
 def _to_node(drive: DrivePath, nodes: NDArray[np.intp], frame: int) -> tuple[int, Float64, float]:
@@ -356,16 +335,10 @@ def _to_node(drive: DrivePath, nodes: NDArray[np.intp], frame: int) -> tuple[int
     return node, T, float(away_m[node])
 
 
-def _inverse(covariance: Float64) -> Float64:
-    """Return the information (6, 6) of a covariance (6, 6)."""
-    return np.asarray(np.linalg.inv(covariance), np.float64)
-
-
 def optimise_path(drive: DrivePath, nodes: NDArray[np.intp], T_world_node: Float64) -> Trajectory:
     """Return every pose moved with the nodes before and after it, interpolated by distance."""
     old, path_m = drive.trajectory.T_world_camera, drive.path_m
-    before = np.searchsorted(nodes, np.arange(len(old)), side="right") - 1
-    before = np.maximum(before, 0)
+    before = np.maximum(np.searchsorted(nodes, np.arange(len(old)), side="right") - 1, 0)
     after = np.minimum(before + 1, len(nodes) - 1)
     # A frame whose pose is not known goes on from the last node.
     same = drive.segment[nodes[after]] == drive.segment[nodes[before]]

@@ -15,14 +15,16 @@ from recon.core.values import Disparity, Rectified, RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, freeze
 from recon.core.values.camera import project
 from recon.places.keyframe import Keyframe, coarse_of, coarse_points, make_keyframe, words_of
-from recon.places.loop import Loop, agreeing_loops, loop_sigmas
 from recon.places.places import (
     VIEW_DEG,
+    Loop,
     Place,
     Places,
     WordIndex,
+    agreeing_loops,
     drift_over,
     is_possible,
+    loop_sigmas,
     most_alike,
     reach_of,
 )
@@ -162,7 +164,13 @@ class LoopDetector:
 
     def look(self, new: StoredKeyframe) -> tuple[Loop, ...]:
         """Add the next keyframe; return its verified loops."""
-        stored = self._compared(new) if self._search else new
+        stored = new
+        if self._search:
+            place, elsewhere = self._place(new), self._places.segments != new.segment
+            among = self._places.near(place) & ~elsewhere
+            here = self._loops_among(among, new, place, *_HERE)
+            there = self._loops_among(elsewhere, new, place, *_ANYWHERE)
+            stored = replace(new, loops=(*here[0], *there[0]), refused=(*here[1], *there[1]))
         self._store.put(stored)
         self.restore(stored)
         return stored.loops
@@ -194,14 +202,6 @@ class LoopDetector:
         words = words_of(keyframe.descriptors)
         pose = stored.T_world_camera
         return Place(keyframe.frame, pose, stored.path_m, stored.segment, reach_m, words)
-
-    def _compared(self, new: StoredKeyframe) -> StoredKeyframe:
-        """The keyframe with its loops to the candidates that are verified."""
-        place, places = self._place(new), self._places
-        elsewhere = places.segments != place.segment
-        here = self._loops_among(places.near(place) & ~elsewhere, new, place, *_HERE)
-        there = self._loops_among(elsewhere, new, place, *_ANYWHERE)
-        return replace(new, loops=(*here[0], *there[0]), refused=(*here[1], *there[1]))
 
     def _loops_among(
         self, among: Bool, new: StoredKeyframe, place: Place, enough: int, failures: int

@@ -53,17 +53,13 @@ class Keyframe:
         if nowhere or not self.coarse.size or np.isinf(self.coarse).any():
             raise ShapeError("a keyframe has no disparities, infinite ones, or features nowhere")
 
-    def xyz(self, camera: RectifiedCamera) -> Float64:
-        """Return float64 (N, 3), the features in camera axes; NaN where the depth is unknown."""
-        return points_of(self.uvd, camera)
-
     def depth_m(self, camera: RectifiedCamera) -> Float64:
         """Return float64 (h, w), depth of the coarse disparities; NaN = unknown."""
         return depth_from_disparity(self.coarse, camera).astype(np.float64)
 
 
 def points_of(uvd: NDArray[Any], camera: RectifiedCamera) -> Float64:
-    """Return points (N, 3) in camera axes of columns, rows and disparities (N, 3)."""
+    """Return points (N, 3) in camera axes of columns, rows, disparities (N, 3); NaN = unknown."""
     depth = depth_from_disparity(uvd[:, 2], camera).astype(np.float64)
     return unproject(uvd[:, 0].astype(np.float64), uvd[:, 1].astype(np.float64), depth, camera)
 
@@ -88,8 +84,9 @@ def make_keyframe(frame: int, pair: Rectified, disparity: Disparity) -> Keyframe
     sift = cv2.SIFT.create(contrastThreshold=_CONTRAST)
     image, zoom = _reduced(pair.left)
     corners = sift.detect(image)
+    places = np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2)
     # OpenCV halves places in its doubled image as if pixels had their centres at a corner.
-    uv = ((_places_of(corners) - _DOUBLED_PX + 0.5) / zoom - 0.5).astype(np.float32)
+    uv = ((places - _DOUBLED_PX + 0.5) / zoom - 0.5).astype(np.float32)
     chosen = _spread(corners, uv, pair.left.shape)
     uv = uv[chosen]
     # Half of the corners are left out; a descriptor takes longer than all that finds a corner.
@@ -173,11 +170,6 @@ def _spread(corners: Sequence[Any], uv: Float32, shape: tuple[int, ...]) -> NDAr
     sizes = np.unique(cell, return_counts=True)[1]
     rank = np.arange(len(cell)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
     return by_cell[np.lexsort((cell[by_cell], rank))[:FEATURES]]
-
-
-def _places_of(corners: Sequence[Any]) -> Float32:
-    """Columns and rows (N, 2) of corners, of which there may be none."""
-    return np.asarray(cv2.KeyPoint.convert(corners), np.float32).reshape(-1, 2)
 
 
 def _disparity(disparity: Disparity, uv: Float32, camera: RectifiedCamera) -> Float32:

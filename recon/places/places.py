@@ -1,12 +1,12 @@
-"""The places of a drive: which may be near by odometry, and which look similar."""
+"""The places of a drive: which may be near by odometry, which look alike, and loops that agree."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from os import PathLike
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import fit_points
 from recon.core.geometry.se3 import angle_rad, apply, invert
 from recon.core.values import Trajectory
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool, Float64, freeze
 
 _LONGEST_RUN: Final = 256  # images: half a million words, which merge in 50 ms and 10 MB
 _BETWEEN: Final = 3.0  # path between two places of a segment that are compared, in reaches
@@ -44,44 +44,21 @@ class Places:
 
     def __init__(self, scale: float = 1.0) -> None:
         self._scale = scale
-        self._frames: list[int] = []
-        self._poses = np.empty((64, 4, 4))
-        self._path_m = np.empty(64)
-        self._segments = np.empty(64, np.int64)
+        self.frames: list[int] = []
+        self.T_world_camera: Float64 = np.empty((0, 4, 4))
+        self.path_m: Float64 = np.empty(0)
+        self.segments: NDArray[np.int64] = np.empty(0, np.int64)  # that each belongs to
         self._words = WordIndex()
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self.frames)
 
     def add(self, place: Place) -> None:
-        count = len(self)
-        if count == len(self._path_m):
-            self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
-            self._path_m = np.concatenate([self._path_m, np.empty_like(self._path_m)])
-            self._segments = np.concatenate([self._segments, np.empty_like(self._segments)])
-        self._poses[count], self._path_m[count] = place.T_world_camera, place.path_m
-        self._segments[count] = place.segment
-        self._frames.append(place.frame)
+        self.frames.append(place.frame)
+        self.T_world_camera = np.concatenate([self.T_world_camera, place.T_world_camera[None]])
+        self.path_m = np.append(self.path_m, place.path_m)
+        self.segments = np.append(self.segments, place.segment)
         self._words.add(place.words)
-
-    @property
-    def frames(self) -> list[int]:
-        return self._frames
-
-    @property
-    def T_world_camera(self) -> Float64:
-        """float64 (N, 4, 4)."""
-        return self._poses[: len(self)]
-
-    @property
-    def path_m(self) -> Float64:
-        """float64 (N,)."""
-        return self._path_m[: len(self)]
-
-    @property
-    def segments(self) -> NDArray[np.int64]:
-        """int64 (N,), segment of the drive that each belongs to."""
-        return self._segments[: len(self)]
 
     def near(self, place: Place) -> Bool:
         """Return bool (N,), those of its segment that drift allows to be in view of a later one."""
@@ -151,9 +128,8 @@ class _Run:
         found = end - begin
         before = np.cumsum(found) - found
         places = np.arange(found.sum()) + np.repeat(begin - before, found)
-        return np.bincount(self.owners[places], np.repeat(weight, found), self.count).astype(
-            np.float64
-        )
+        summed = np.bincount(self.owners[places], np.repeat(weight, found), self.count)
+        return summed.astype(np.float64)
 
 
 class WordIndex:
@@ -302,15 +278,14 @@ def fit_to_path(
     ``drift_m`` is by how much the path may be off at its end, standard deviation.
     """
     rigid, scaled = (fit_points(ours_m, position_m, scaled=scaled) for scaled in (False, True))
-    path_m = float(np.linalg.norm(np.diff(ours_m, axis=0), axis=1).sum())
-    spread_m = _apart_m(ours_m, ours_m.mean(axis=0))
+    path_m = max(float(np.linalg.norm(np.diff(ours_m, axis=0), axis=1).sum()), _SHORTEST_M)
+    spread_m = max(_apart_m(ours_m, ours_m.mean(axis=0)), _SHORTEST_M)
     return PathFit(
         rms_m=_apart_m(apply(rigid.T_to_from, ours_m), position_m),
         scaled_m=_apart_m(apply(scaled.T_to_from, scaled.scale * ours_m), position_m),
         scale=scaled.scale,
         most_m=SIGMAS * math.hypot(drift_m, sigma_m),
-        most_scaling=SIGMAS
-        * math.hypot(drift_m / max(path_m, _SHORTEST_M), sigma_m / max(spread_m, _SHORTEST_M)),
+        most_scaling=SIGMAS * math.hypot(drift_m / path_m, sigma_m / spread_m),
     )
 
 
@@ -329,3 +304,88 @@ def drift_at_end(
 def _apart_m(ones: Float64, others: Float64) -> float:
     """How far points (N, 3) are from others, root mean square."""
     return float(np.sqrt(np.mean(np.sum((ones - others) ** 2, axis=-1))))
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Two frames that show the same place, and the motion between them."""
+
+    first: int  # number of the earlier frame
+    last: int  # number of the later frame
+    T_first_last: Float64  # (4, 4)
+    # float64 (6, 6) of a step (translation in metres, rotation vector in radians) in the axes of
+    # the later frame
+    information: Float64
+    inliers: int  # matches that agree in both frames
+    dense_ratio: float  # fraction of the coarse disparities that agree
+    same_frame: bool = False  # whether the two are one frame, in two recordings that overlap
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_first_last", np.float64, (4, 4))
+        freeze(self, "information", np.float64, (6, 6))
+
+
+Poses: TypeAlias = Mapping[int, tuple[Float64, float, int]]
+"""For each keyframe its pose by odometry, the path up to it, and the segment of the drive that it
+belongs to: nothing is known between segments."""
+
+
+def loop_sigmas(scale: float) -> Drift:
+    """Return standard deviations of a verified loop, added to the drift: small, but never zero."""
+    return Drift(0.3 * scale, np.deg2rad(1.0))
+
+
+MIN_AGREEING: Final = 3  # loops that must agree, no two between the same keyframes
+_NEAR_M: Final = 12.0  # path on a road within which neighbouring loops are compared
+_MAJORITY: Final = 2  # keyframes whose loops confirm one, for each whose loop contradicts it
+
+
+def agreeing_loops(
+    loops: Sequence[Loop],
+    firsts: Poses,
+    lasts: Poses,
+    *,
+    keyframes: int = MIN_AGREEING,
+    scale: float = 1.0,
+) -> list[Loop]:
+    """The verified loops that enough others confirm, and few contradict.
+
+    Two loops and the odometry between their ends form a cycle that must close within the drift over
+    its two odometry sections. False loops would have to be wrong in the same way several times.
+    Where a row of similar houses makes them so, right loops nearby contradict them: without a clear
+    majority none is accepted. ``firsts`` and ``lasts`` give pose and path of the keyframes in which
+    loops begin and end, which may have different axes; the path is 0 in a map without drift of its
+    own. ``keyframes`` is the least number of later keyframes among loops that agree, ``scale`` that
+    of the scene.
+    """
+    near_m, sigmas = scale * _NEAR_M, loop_sigmas(scale)
+
+    def closes(one: Loop, other: Loop) -> bool:
+        """Whether two loops agree within the drift of the odometry between them."""
+        T_lasts, lasts_m = _between(one.last, other.last, lasts)
+        T_firsts, firsts_m = _between(one.first, other.first, firsts)
+        ring = invert(one.T_first_last) @ T_firsts @ other.T_first_last @ invert(T_lasts)
+        return is_possible(ring, drift_over(lasts_m + firsts_m, scale), sigmas)
+
+    paths_m = np.array([(firsts[loop.first][1], lasts[loop.last][1]) for loop in loops])
+    between = np.array([(firsts[loop.first][2], lasts[loop.last][2]) for loop in loops])
+    agreeing = []
+    for number, loop in enumerate(loops):
+        firsts_m, lasts_m = np.abs(paths_m - paths_m[number]).T
+        near = np.flatnonzero((lasts_m <= near_m) & (between == between[number]).all(axis=1))
+        rings = {k: closes(loop, loops[k]) for k in near.tolist()}
+        # Counted by keyframes: how many views of a place each finds is chance.
+        against = {loops[k].last for k, closed in rings.items() if not closed}
+        # Loops to elsewhere on the path may contradict, but over that distance agree too easily.
+        same = [loops[k] for k, closed in rings.items() if closed and firsts_m[k] <= near_m]
+        behind = {other.last for other in same}
+        enough = max(keyframes, _MAJORITY * len(against))
+        if len(same) >= MIN_AGREEING and len(behind) >= enough:
+            agreeing.append(loop)
+    return agreeing
+
+
+def _between(first: int, last: int, poses: Poses) -> tuple[Float64, float]:
+    """``T_first_last`` by odometry, and the path between the two."""
+    (T_world_first, from_m, _), (T_world_last, to_m, _) = poses[first], poses[last]
+    return invert(T_world_first) @ T_world_last, abs(to_m - from_m)

@@ -17,6 +17,8 @@ opposite motion in the axes of the later node, which the adjoint gives:
 what a switch on the edge costs where it is best set. Its slope is the weight ``(1 + χ²/h)⁻²``, a
 quarter at ``χ² = h``.
 
+**Measured positions**, by GNSS or a total station, are edges from one more node, the survey.
+
 **Solution.** Levenberg-Marquardt: a node has edges to few others, so the normal equations are
 sparse, and their factors nearly so.
 
@@ -38,10 +40,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from recon.core.errors import RegistrationError
+from recon.core.errors import RegistrationError, ShapeError
 from recon.core.geometry.alignment import Problem, minimise
-from recon.core.geometry.se3 import adjoint, hat, invert
-from recon.core.values.arrays import Bool, Float64, freeze
+from recon.core.geometry.se3 import adjoint, hat, invert, make_transform
+from recon.core.values import Trajectory
+from recon.core.values.arrays import Bool, Float64, Int32, freeze, frozen_array
 
 _ROUNDS: Final = 30
 _STILL: Final = 1e-6  # gain of a step, as a fraction of the cost, that is not worth another one
@@ -128,7 +131,11 @@ class PoseGraph:
         steps, chi2 = self._misfits(T_world_node)
         J_last = np.zeros((len(T), 6, 6))
         J_last[:, :3, :3] = (self.T_last_first @ T)[:, :3, :3]
-        J_last[:, 3:, 3:] = _right_inverse(steps[:, 3:])
+        # ``Jr⁻¹`` of the rotation vectors; below the least angle the factor is 1/12.
+        angle = np.maximum(np.linalg.norm(steps[:, 3:], axis=1), 1e-4)
+        factor = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
+        K = hat(steps[:, 3:])
+        J_last[:, 3:, 3:] = np.eye(3) + 0.5 * K + factor[:, None, None] * (K @ K)
         J = np.concatenate([-J_last @ adjoint(invert(T)), J_last], axis=2)
         weighted = self._weights(chi2)[:, None, None] * self.information @ J
         return np.swapaxes(weighted, 1, 2) @ J, np.einsum("eij,ei->ej", weighted, steps)
@@ -235,9 +242,77 @@ def solve_damped(matrix: csc_array, right: Float64, damping: float) -> Float64 |
     return np.asarray(factors.solve(right))
 
 
-def _right_inverse(turns: Float64) -> Float64:
-    """Return ``Jr⁻¹`` (N, 3, 3) of rotation vectors (N, 3)."""
-    angle = np.maximum(np.linalg.norm(turns, axis=1), 1e-4)  # below, the factor is 1/12
-    factor = (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2
-    K = hat(turns)
-    return np.asarray(np.eye(3) + 0.5 * K + factor[:, None, None] * (K @ K))
+_NO_TURN: Final = 1e-9  # information of a rotation that was not measured; the optimiser needs some
+
+
+@dataclass(frozen=True, eq=False)
+class Fixes:
+    """Where something on a vehicle was measured during a drive."""
+
+    frames: Int32  # int32 (N,), the frame nearest to each measurement
+    # float64 (N, 3), where it was then, from the camera of that frame, in its axes
+    offset_m: Float64
+    position_m: Float64  # (N, 3), where it was measured, in the coordinates of a survey
+    sigma_m: Float64  # (N,), standard deviations of a measured coordinate
+
+    def __post_init__(self) -> None:
+        count = len(self.frames)
+        frozen_array("frames", self.frames, np.int32, (count,))
+        frozen_array("offset_m", self.offset_m, np.float64, (count, 3))
+        frozen_array("position_m", self.position_m, np.float64, (count, 3))
+        # Maps of before have one for all.
+        each_m = np.broadcast_to(np.asarray(self.sigma_m, np.float64), (count,))
+        object.__setattr__(self, "sigma_m", each_m)
+        if not (np.isfinite(self.position_m).all() and (self.sigma_m > 0.0).all()):
+            raise ShapeError("measured positions are finite, and have a standard deviation")
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def by_path(self, trajectory: Trajectory) -> Float64:
+        """Return where a path has what was measured: float64 (N, 3), in its world."""
+        return _placed(trajectory.T_world_camera[self.frames], self.offset_m)
+
+
+NO_FIXES: Final = Fixes(np.zeros(0, np.int32), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+"""Of a drive along which nothing was measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """What holds drives at measured positions."""
+
+    T_world_survey: Float64  # (4, 4), about where the coordinates of the survey are
+    fixes: Sequence[Fixes]  # those of each drive, of which some may be empty
+
+    def edges(
+        self, drives: Sequence[Trajectory], nodes: Sequence[NDArray[np.intp]], T_world_node: Float64
+    ) -> list[PoseEdge]:
+        """An edge from the survey to each node near which something was measured.
+
+        It says where the node is, and not how it is turned. What is near one node counts as one
+        measurement, as good as its best: neighbours are off by the same. The last of the poses
+        ``T_world_node`` is the survey's; an antenna beside the camera moves as it turns.
+        """
+        survey, begin, edges = len(T_world_node) - 1, 0, list[PoseEdge]()
+        R_survey_world = T_world_node[survey, :3, :3].T
+        for path, own, fixes in zip(drives, nodes, self.fixes, strict=True):
+            # The node nearest to each measurement, and where that was in the node's axes.
+            near = np.searchsorted((own[1:] + own[:-1]) / 2, fixes.frames)
+            T_node_world = invert(path.T_world_camera[own[near]])
+            offset_m = _placed(T_node_world, fixes.by_path(path))
+            for k in np.unique(near).tolist():
+                R = R_survey_world @ T_world_node[begin + k, :3, :3]
+                here = near == k
+                weights = fixes.sigma_m[here] ** -2
+                places_m = fixes.position_m[here] - offset_m[here] @ R.T
+                place_m = np.average(places_m, axis=0, weights=weights)
+                information = np.diag(3 * [weights.max()] + 3 * [_NO_TURN])
+                edges.append(PoseEdge(survey, begin + k, make_transform(R, place_m), information))
+            begin += len(own)
+        return edges
+
+
+def _placed(T: Float64, offset_m: Float64) -> Float64:
+    """Return offsets (N, 3) by as many transforms (N, 4, 4)."""
+    return np.asarray(np.einsum("nij,nj->ni", T[:, :3, :3], offset_m) + T[:, :3, 3])

@@ -23,9 +23,9 @@ from recon.rig.written import form_of, nearest_of_kalibr, write_rig
 from recon.sources.one_pair import OnePair, PairInput
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor, StereoSettings
+from recon.stereo.observe import Support
 from recon.stereo.rectify.epipolar import EpipolarAlignment, correct_rig
 from recon.stereo.rectify.rectifier import turns_of
-from recon.stereo.support import Support
 
 _RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth error is predicted
 # Findings of a pair that images alone support, and those that need a calibration. The inspection of

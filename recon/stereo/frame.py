@@ -29,17 +29,16 @@ from recon.core.values import (
     Rig,
     StereoPair,
 )
-from recon.core.values.arrays import Float32, UInt8, frozen_array
+from recon.core.values.arrays import frozen_array
 from recon.core.work import Stopwatch
 from recon.stereo import open3d_clouds
 from recon.stereo.kernels import points
 from recon.stereo.kernels.finish import count_supporters
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MatchingSettings, check_matcher
-from recon.stereo.observe import Effort, Inspected, Matching, MeasuredDepth, Observer
+from recon.stereo.observe import Effort, Inspected, Matching, MeasuredDepth, Observer, Support
 from recon.stereo.rectify.features import inspect_pair
 from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
-from recon.stereo.support import Support
 
 _INSPECT_EVERY: Final = 50  # frames: swapped cameras and rows that are off do not change
 
@@ -200,9 +199,13 @@ def back_project(
         )
     if not settings.inferred:
         disparity = disparity.only_measured()
+    confidence = disparity.confidence
+    if settings.inferred:  # its sign says through the kernel which pixels are
+        signed = np.where(disparity.inferred, -confidence, confidence)
+        confidence = frozen_array("confidence", signed, np.float32, (None, None))
     maps = points.Maps(
         values=disparity.values,
-        confidence=_signed(disparity) if settings.inferred else disparity.confidence,
+        confidence=confidence,
         sigma=disparity.sigma_px,
         colours=pair.left[:, :, None] if pair.left_rgb is None else pair.left_rgb,
         usable=np.zeros((0, 0), np.bool_) if pair.valid is None else pair.valid,
@@ -217,12 +220,6 @@ def back_project(
         inferred=np.signbit(found.confidence).astype(np.uint8) if settings.inferred else None,
         frame="camera",
     )
-
-
-def _signed(disparity: Disparity) -> Float32:
-    """Return confidences whose sign says through the kernel which pixels are inferred."""
-    sure = np.where(disparity.inferred, -disparity.confidence, disparity.confidence)
-    return frozen_array("confidence", sure, np.float32, (None, None))
 
 
 def _rules(camera: RectifiedCamera, settings: CloudSettings, normals: bool) -> points.PointRules:
@@ -263,17 +260,12 @@ def remove_flying_edges(disparity: Disparity) -> Disparity:
 
     Ref: Burt & Julesz, "A disparity gradient limit for binocular fusion", Science 208 (1980).
     """
-    needed = _MIN_SUPPORT * (2 * _RADIUS_PX + 1) ** 2
-    return disparity.reject(_support(disparity.values) < needed, Reason.EDGE)
-
-
-def _support(values: Float32) -> UInt8:
-    """Return how many pixels of each window support its centre, with itself."""
     r = _RADIUS_PX
-    padded = cv2.copyMakeBorder(values, r, r, r, r, cv2.BORDER_REFLECT_101)
+    padded = cv2.copyMakeBorder(disparity.values, r, r, r, r, cv2.BORDER_REFLECT_101)
     away = np.arange(-r, r + 1)
     limits = _TOLERANCE_PX + _MAX_GRADIENT * np.hypot(away[:, None], away)
-    return count_supporters(padded, limits.astype(np.float32))
+    support = count_supporters(padded, limits.astype(np.float32))
+    return disparity.reject(support < _MIN_SUPPORT * (2 * r + 1) ** 2, Reason.EDGE)
 
 
 _STATISTICAL_SIGMAS: Final = 2.0  # of the mean distance: limit of the statistical filter

@@ -73,8 +73,12 @@ def agree_normals(xyz: NDArray[Any], normals: NDArray[Any], neighbours: int) -> 
     try:
         return _orient(_legacy(xyz), normals, neighbours)
     except RuntimeError:
-        # Qhull finds no simplex among points of one plane or one sphere; moved a little, it does.
-        return _orient(_legacy(_joggled(xyz)), normals, neighbours)
+        # Qhull finds no simplex among points of one plane or one sphere; moved by a millionth of
+        # their extent, the same way each time, it does.
+        points = _finite(xyz)
+        reach = 1e-6 * float(np.ptp(points, axis=0).max())
+        moved = points + np.random.default_rng(0).uniform(-reach, reach, points.shape)
+        return _orient(_legacy(moved), normals, neighbours)
 
 
 def _orient(cloud: Any, normals: NDArray[Any], neighbours: int) -> Float32:
@@ -82,13 +86,6 @@ def _orient(cloud: Any, normals: NDArray[Any], neighbours: int) -> Float32:
     with _quiet():
         cloud.orient_normals_consistent_tangent_plane(min(neighbours, len(cloud.points) - 1))
     return _array(cloud.normals)
-
-
-def _joggled(xyz: NDArray[Any]) -> Float64:
-    """Return the points, moved by up to a millionth of their extent, the same way each time."""
-    points = _finite(xyz)
-    reach = 1e-6 * float(np.ptp(points, axis=0).max())
-    return points + np.random.default_rng(0).uniform(-reach, reach, points.shape)
 
 
 def nearest(

@@ -28,9 +28,9 @@ from recon.map.store.session import OPTIMISED_POSES, POSES_BEFORE_LINKS, Session
 from recon.map.store.trees import Link
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
-from recon.places.fixes import Fixes
-from recon.places.keyframe import Keyframe
-from recon.places.loop import Loop
+from recon.places.keyframe import Keyframe, points_of
+from recon.places.places import Loop
+from recon.places.pose_graph import Fixes
 from recon.stereo.rectify.epipolar import as_raw
 from tests.hostile.refusals import refusal
 
@@ -87,7 +87,7 @@ def read_map(path: Path) -> None:
             _ = session.camera, session.fixes, session.trajectory, session.corrections()
             _ = session.loops, session.state(), session.rig
             _ = [session.rays(frame)[0].cloud() for frame in range(session.ray_frames)]
-            _ = [stored.keyframe.xyz(session.camera) for stored in session.keyframes]
+            _ = [points_of(stored.keyframe.uvd, session.camera) for stored in session.keyframes]
             join_fused(submap.fused for submap in session.submaps).cloud(0.1, 1)
             join_occupancy(submap.occupancy for submap in session.submaps).voxels(0.1)
 

@@ -8,7 +8,7 @@ import pytest
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import RectifiedCamera
 from recon.core.values.camera import project
-from recon.look.halves import disagreement
+from recon.look.fit import disagreement
 from recon.odometry.pose import TrackWindow
 
 CAMERA = RectifiedCamera(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from recon.core.geometry.se3 import exp_so3
 from recon.core.values import RectifiedCamera
-from recon.look import measures
+from recon.look import sample
 from recon.look.findings import Finding, verdict_of
 from recon.look.sample import QUICK, THOROUGH, plan_windows
 from recon.look.tracks import REACH
@@ -87,14 +87,14 @@ def texture(seed: int = 0) -> np.ndarray:
 
 def test_sharpness_falls_with_blur_and_not_with_brightness():
     image = texture()
-    sharp = measures.measure_sharpness(image)
+    sharp = sample.measure_sharpness(image)
     blurred = [
-        measures.measure_sharpness(cv2.GaussianBlur(image, (0, 0), s)) for s in (0.7, 1.2, 2.0, 3.0)
+        sample.measure_sharpness(cv2.GaussianBlur(image, (0, 0), s)) for s in (0.7, 1.2, 2.0, 3.0)
     ]
     assert sharp > blurred[0] > blurred[1] > blurred[2] > blurred[3]
     dark = cv2.convertScaleAbs(image, alpha=0.5)
-    assert measures.measure_sharpness(np.asarray(dark)) == pytest.approx(sharp, abs=0.03)
-    assert measures.measure_sharpness(np.full((64, 64), 7, np.uint8)) == 0
+    assert sample.measure_sharpness(np.asarray(dark)) == pytest.approx(sharp, abs=0.03)
+    assert sample.measure_sharpness(np.full((64, 64), 7, np.uint8)) == 0
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.0, 1.4, 1.8])
@@ -103,7 +103,7 @@ def test_gain_is_measured_although_bright_surfaces_saturate(factor):
     right = cv2.convertScaleAbs(left, alpha=factor)
     rng = np.random.default_rng(0)
     uv = rng.uniform([10, 10], [390, 290], (500, 2)).astype(np.float32)
-    gains = measures.measure_gain(np.asarray(left), np.asarray(right), uv, uv)
+    gains = sample.measure_gain(np.asarray(left), np.asarray(right), uv, uv)
     assert np.median(gains) == pytest.approx(factor, rel=0.02)
 
 
@@ -112,10 +112,10 @@ def test_a_late_camera_is_measured_by_the_rows_that_move():
     flow = rng.uniform(-12, 12, 2000)
     error = 0.4 * flow + rng.normal(0, 0.3, 2000)
     error[:150] = rng.uniform(-10, 10, 150)
-    found = measures.measure_time_skew(error, flow)
+    found = sample.measure_time_skew(error, flow)
     assert found[0] == pytest.approx(0.4, abs=0.01)
     assert abs(found[0] - 0.4) < 5 * found[1] < 0.02
-    assert measures.measure_time_skew(error, 0.01 * flow) is None
+    assert sample.measure_time_skew(error, 0.01 * flow) is None
 
 
 def test_speed_is_that_of_the_rig_and_scales_with_the_baseline():
@@ -129,18 +129,18 @@ def test_speed_is_that_of_the_rig_and_scales_with_the_baseline():
     left = seen(xyz, CAMERA.cx_px)
     right = seen(xyz - np.array([CAMERA.baseline_m, 0, 0]), CAMERA.cx_right_px)
     later = seen(xyz - np.array([0.1, 0.0, 1.2]), CAMERA.cx_px)
-    moved_m = measures.measure_speed(left, right, later, CAMERA)
+    moved_m = sample.measure_speed(left, right, later, CAMERA)
     assert moved_m == pytest.approx(np.hypot(0.1, 1.2), rel=0.01)
-    assert measures.measure_speed(left[:10], right[:10], later[:10], CAMERA) is None
+    assert sample.measure_speed(left[:10], right[:10], later[:10], CAMERA) is None
 
 
 def test_repeats_are_counted_apart_from_frozen_cameras_and_the_worst_finding_decides():
     images = [texture(seed) for seed in range(8)]
-    counter = measures.RepeatCounter()
+    counter = sample.RepeatCounter()
     for left, right in ((0, 0), (1, 0), (2, 0), (3, 0), (4, 4), (4, 4), (5, 5)):
         counter.add(images[left], images[right])
     assert (counter.steps, counter.both, counter.frozen) == (6, 1, [0, 3])
-    later = measures.RepeatCounter()
+    later = sample.RepeatCounter()
     for _ in range(3):
         later.add(images[5], images[5])
     counter.join(later)

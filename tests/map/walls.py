@@ -18,7 +18,7 @@ from recon.map.store.session import Session, SessionInfo
 from recon.map.store.trees import Link
 from recon.map.tiles import Tiles
 from recon.odometry.protocol import OdometryHealth
-from recon.places.loop import Loop
+from recon.places.places import Loop
 
 CONFIG = load_config(None, ["submaps.length_m=8", "fusion.min_count=1"])
 CAMERA = RectifiedCamera(100.0, 9.0, 5.0, 9.0, 0.5, 20, 12)

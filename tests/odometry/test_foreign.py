@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 import recon
 from recon.cli import app
 from recon.core.errors import RegistrationError, SettingsError
-from recon.odometry.foreign import ForeignOdometry
-from recon.odometry.registry import ODOMETRIES, make_odometry
+from recon.odometry.registry import ODOMETRIES, ForeignOdometry, make_odometry
 from tests.stereo.match.test_foreign_matchers import install_plugin
 
 

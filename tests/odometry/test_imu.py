@@ -10,9 +10,8 @@ from recon.core.geometry.se3 import Motion, angle_rad, exp_so3, invert, log_so3,
 from recon.core.values import ImuRecord, Trajectory
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.guide import Guided
-from recon.odometry.imu import Gyro, ImuGuide
+from recon.odometry.imu import Gyro, ImuGuide, ImuSpan
 from recon.odometry.imu_fit import fit_imu
-from recon.odometry.imu_runs import ImuSpan
 from recon.odometry.visual import VisualOdometry
 from tests.odometry.conftest import CAMERA
 

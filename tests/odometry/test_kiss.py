@@ -71,7 +71,7 @@ def test_what_is_lone_or_changes_down_the_column_alone_is_not_taken(see, blind):
     assert len(kiss.select_points(blind(), 30.0)) == 0
 
 
-OPTIONS = kiss.KissIcpOptions(max_range_m=30.0, voxel_m=0.3)
+OPTIONS = {"max_range_m": 30.0, "voxel_m": 0.3}
 T_MOVED = make_transform(exp_so3(np.array([0.0, 0.02, 0.0])), np.array([0.1, 0.0, 0.15]))
 
 
@@ -90,7 +90,7 @@ def seen_from(T_world_camera: np.ndarray) -> np.ndarray:
 
 
 def aligned_to_room(prior: np.ndarray) -> np.ndarray:
-    made = kiss.KissIcp(OPTIONS)
+    made = kiss.KissIcp(**OPTIONS)
     made.set_map(room())
     return made.align(seen_from(T_MOVED), prior, 0.5, 0.25).T_world_camera
 
@@ -104,7 +104,7 @@ def test_points_in_camera_axes_give_the_pose_of_the_camera(scale):
 
 
 def test_frames_that_are_added_make_the_map():
-    icp = kiss.KissIcp(OPTIONS)
+    icp = kiss.KissIcp(**OPTIONS)
     icp.add(seen_from(np.eye(4)), np.eye(4))
     off = invert(T_MOVED) @ icp.align(seen_from(T_MOVED), np.eye(4), 0.5, 0.25).T_world_camera
     # Points are voxel-sampled, and ICP ends at steps of 1e-4: centimetres.
@@ -112,7 +112,7 @@ def test_frames_that_are_added_make_the_map():
 
 
 def test_without_a_map_the_guess_stays():
-    alignment = kiss.KissIcp(OPTIONS).align(seen_from(np.eye(4)), T_MOVED, 0.5, 0.25)
+    alignment = kiss.KissIcp(**OPTIONS).align(seen_from(np.eye(4)), T_MOVED, 0.5, 0.25)
     np.testing.assert_allclose(alignment.T_world_camera, T_MOVED, atol=1e-12)
 
 
@@ -124,7 +124,7 @@ def test_environment_variables_change_nothing(value, monkeypatch):
 
 
 def test_bad_points_and_poses_and_foreign_exceptions_are_refused(monkeypatch):
-    icp = kiss.KissIcp(OPTIONS)
+    icp = kiss.KissIcp(**OPTIONS)
     for xyz in (np.zeros((0, 3)), np.zeros((5, 2)), np.full((5, 3), np.nan), np.zeros(3)):
         for call in (lambda p: icp.add(p, np.eye(4)), lambda p: icp.align(p, np.eye(4), 1, 1)):
             with pytest.raises(RegistrationError):
@@ -132,7 +132,7 @@ def test_bad_points_and_poses_and_foreign_exceptions_are_refused(monkeypatch):
     for pose in (np.full((4, 4), np.nan), np.eye(3)):
         with pytest.raises(RegistrationError):
             icp.align(room(), pose, 0.5, 0.25)
-    icp = kiss.KissIcp(OPTIONS)
+    icp = kiss.KissIcp(**OPTIONS)
 
     def fail(*_: object) -> None:
         raise RuntimeError("from the library")

@@ -17,9 +17,7 @@ from recon.core.progress import showing
 from recon.core.values import Disparity
 from recon.map.store.records import Store
 from recon.odometry.protocol import Odometry, OdometryFrame
-from recon.odometry.sfm.colmap import find_features
-from recon.odometry.sfm.find import SfmOptions, find_poses
-from recon.odometry.sfm.found import FoundOdometry
+from recon.odometry.sfm import FoundOdometry, SfmOptions, find_features, find_poses
 from recon.sources.registry import open_source
 from recon.stereo.rectify.rectifier import RectificationSettings
 from recon.street.settings import StreetScene
@@ -97,7 +95,7 @@ def test_photos_become_a_map_whose_first_warning_names_what_is_missing(photos, f
 
 def test_of_many_pairs_those_are_matched_that_look_alike(photos, found, monkeypatch):
     for name, value in {"_ALL": 4, "_ALIKE": 8, "_NEXT": ()}.items():
-        monkeypatch.setattr(f"recon.odometry.sfm.colmap.{name}", value)
+        monkeypatch.setattr(f"recon.odometry.sfm.{name}", value)
     (model,) = find_poses(photos, OPTIONS).models
     assert model.frames.tolist() == found.models[0].frames.tolist()
     np.testing.assert_allclose(model.T_world_camera, found.models[0].T_world_camera, atol=0.06)
@@ -178,7 +176,7 @@ def test_a_request_to_end_the_program_still_interrupts_it():
     pytest.importorskip("pycolmap", reason="the extra sfm is not installed")
     script = """
 import os, signal
-from recon.odometry.sfm.colmap import load_colmap
+from recon.odometry.sfm import load_colmap
 signal.signal(signal.SIGTERM, signal.default_int_handler)
 load_colmap()
 try:

@@ -12,8 +12,7 @@ from recon.core.values import Disparity, Trajectory
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.features import in_crowd
 from recon.odometry.health import segment_numbers
-from recon.odometry.prior import MotionPrior
-from recon.odometry.prior_axes import find_axes, first_moving
+from recon.odometry.prior import MotionPrior, find_axes, first_moving
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
 from recon.odometry.settings import OdometrySettings, PriorSettings

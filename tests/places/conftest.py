@@ -16,8 +16,7 @@ from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import DrivePath
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.keyframe import Keyframe, make_keyframe
-from recon.places.loop import Loop
-from recon.places.places import path_lengths
+from recon.places.places import Loop, path_lengths
 from recon.street.render import StreetCamera
 from recon.street.settings import CORNER_M, StreetScene
 from recon.street.street import build_street

@@ -12,8 +12,7 @@ from recon.core.geometry.se3 import apply, as_step, as_transform, invert
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.camera import project
 from recon.places import adjustment
-from recon.places.adjustment import adjust_path, shared_points
-from recon.places.bundle import Bundle, Sightings
+from recon.places.adjustment import Bundle, Sightings, adjust_path, shared_points
 from recon.places.closure import Closure
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe

@@ -12,8 +12,7 @@ from recon.core.geometry import se3
 from recon.core.values import Trajectory
 from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Constraint, DrivePath, close_loops, join_drives
-from recon.places.loop import Loop, agreeing_loops
-from recon.places.places import Drift, drift_over, is_possible, path_lengths
+from recon.places.places import Drift, Loop, agreeing_loops, drift_over, is_possible, path_lengths
 from tests.places.conftest import INFORMATION, drifted, drive_path, true_loop
 
 LAP = 200

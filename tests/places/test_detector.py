@@ -13,7 +13,7 @@ from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.places import places
 from recon.places.detector import KnownPlaces, KnownView, LoopDetector
 from recon.places.keyframe import make_keyframe
-from recon.places.loop import agreeing_loops
+from recon.places.places import agreeing_loops
 from tests.places.conftest import LAP, PERIOD, KeyframeMemory, drifted
 
 AHEAD = RectifiedCamera(180.0, 159.5, 59.5, 159.5, 0.54, 320, 120)

@@ -9,7 +9,7 @@ from recon.core.geometry.alignment import fit_points
 from recon.core.geometry.se3 import angle_rad, apply, exp_so3, invert, make_transform
 from recon.core.values import Trajectory
 from recon.places.closure import JoinedDrives, join_drives
-from recon.places.fixes import NO_FIXES, Fixes, Held
+from recon.places.pose_graph import NO_FIXES, Fixes, Held
 from tests.places.conftest import drive_path
 
 T_SURVEY_WORLD = make_transform(exp_so3(np.array([0.1, 2.0, -0.3])), np.array([30.0, -8.0, 5.0]))

@@ -13,10 +13,9 @@ from recon.core.geometry import se3
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.camera import project
 from recon.places import verify as verify_file
-from recon.places.align import MIN_INLIERS, Seen, find_motion, refine
 from recon.places.keyframe import FEATURES, WORDS, Keyframe, make_keyframe, points_of, words_of
 from recon.places.places import WordIndex
-from recon.places.verify import dense_agreement, verify
+from recon.places.verify import MIN_INLIERS, Seen, dense_agreement, find_motion, refine, verify
 from tests.places.conftest import LAP
 
 CAMERA = RectifiedCamera(180.0, 159.5, 59.5, 159.5, 0.54, 320, 120)

@@ -23,7 +23,7 @@ from recon.core.values import (
 from recon.export.pair import check_coverage
 from recon.rig.audit import check_found
 from recon.sources.one_pair import PairInput
-from recon.stereo.support import Support
+from recon.stereo.observe import Support
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 

@@ -19,7 +19,7 @@ from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.images.image import write_image
 from recon.map.drive.sequence import map_sequence
 from recon.odometry.features import find_in_right
-from recon.odometry.sfm.find import check_sfm
+from recon.odometry.sfm import check_sfm
 from recon.rig.audit import audit_source
 from recon.run.run import Run
 from recon.sources.registry import open_source, recognise_source

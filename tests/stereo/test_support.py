@@ -19,7 +19,7 @@ from recon.io.middlebury import read_middlebury_scene, stand_in_camera
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.frame import FrameReconstructor
-from recon.stereo.support import Support
+from recon.stereo.observe import Support
 from recon.street.settings import StreetScene
 from tests.hostile.refusals import assert_refused, run
 

@@ -24,7 +24,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float32, Float64
 from recon.evaluation import disparity as errors
-from recon.stereo.match.holes import fill_holes
+from recon.stereo.match.fill import fill_holes
 
 # Pixels that are scored: those seen by both cameras, or occluded ones as well.
 MASKS: Final = {"nonocc": False, "all": True}

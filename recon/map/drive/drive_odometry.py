@@ -14,10 +14,9 @@ from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.map.settings import DriveSettings
 from recon.odometry.guide import Guide
+from recon.odometry.imu import seen_runs
 from recon.odometry.imu_fit import FittedImu, fit_imu
-from recon.odometry.imu_runs import seen_runs
-from recon.odometry.prior import MotionPrior
-from recon.odometry.prior_axes import find_axes, first_moving
+from recon.odometry.prior import MotionPrior, find_axes, first_moving
 from recon.odometry.protocol import Odometry, OdometryFrame
 from recon.odometry.registry import KnownPoses, make_odometry
 from recon.odometry.settings import PriorSettings

@@ -44,8 +44,7 @@ from recon.odometry.checked import CheckedOdometry
 from recon.odometry.health import name_frames, segment_numbers
 from recon.odometry.imu_fit import FittedImu
 from recon.odometry.protocol import Odometry, OdometryHealth
-from recon.odometry.sfm.find import SfmOptions, find_poses
-from recon.odometry.sfm.found import FoundOdometry, FoundPoses
+from recon.odometry.sfm import FoundOdometry, FoundPoses, SfmOptions, find_poses
 from recon.odometry.visual import VisualOdometry
 from recon.sources.source import StereoSource, check_source
 from recon.stereo.frame import CloudSettings, FrameReconstructor, ReconstructedFrame

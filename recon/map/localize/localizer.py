@@ -24,8 +24,7 @@ from recon.odometry.visual import VisualEstimate, VisualOdometry
 from recon.places.closure import loop_bias
 from recon.places.detector import KnownPlaces
 from recon.places.keyframe import Keyframe, make_keyframe
-from recon.places.loop import Loop, agreeing_loops
-from recon.places.places import path_lengths
+from recon.places.places import Loop, agreeing_loops, path_lengths
 
 _VIEWS: Final = 2  # nearest views of the map that each frame is compared with
 _SURFACES_EVERY: Final = 3

@@ -30,8 +30,8 @@ from recon.io.files import reading
 from recon.map.localize.belief import MAX_SIGMA_DEG, MAX_SIGMA_M, Belief
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
-from recon.odometry.kiss import IcpAlignment, KissIcp, KissIcpOptions, select_points
-from recon.odometry.prior import MAX_SIGMAS
+from recon.odometry.guide import MAX_SIGMAS
+from recon.odometry.kiss import IcpAlignment, KissIcp, select_points
 from recon.odometry.protocol import OdometryFrame
 from recon.places.places import SIGMAS
 
@@ -81,7 +81,8 @@ class Surroundings:
         self._range_m = max_range_m
         self._parts = [part for session in map_.linked for part in _parts(map_, session)]
         self._scale = scale = map_.first.scale
-        self._icp = KissIcp(KissIcpOptions(max_range_m, scale * _VOXEL_M, 50, scale * _STILL))
+        voxel_m, still = scale * _VOXEL_M, scale * _STILL
+        self._icp = KissIcp(max_range_m, voxel_m, iterations=50, convergence=still)
         self._loaded_at = np.full(3, np.inf)
         self._surfaces = describe_surfaces(np.zeros((0, 3)), scale * _SURFACE_M)
         self._offset = np.zeros(6)

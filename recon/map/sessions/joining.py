@@ -28,8 +28,8 @@ from recon.map.store.trees import Link
 from recon.odometry.health import segment_numbers
 from recon.places.closure import Constraint, DrivePath, join_drives
 from recon.places.detector import KnownPlaces
-from recon.places.fixes import Held
-from recon.places.loop import Loop, agreeing_loops
+from recon.places.places import Loop, agreeing_loops
+from recon.places.pose_graph import Held
 
 _INFORMATION: Final = 1e8  # of what is the same: 0.1 mm and 0.1 mrad, as no covariance may be zero
 _FEWEST: Final = 5  # links from which a scale is estimated, besides six parameters of the place

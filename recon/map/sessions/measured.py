@@ -29,8 +29,8 @@ from recon.io.positions import Positions
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.health import expected_drift
-from recon.places.fixes import Fixes
 from recon.places.places import RECEIVER_M, SIGMAS, drift_at_end, fit_to_path
+from recon.places.pose_graph import Fixes
 from recon.sources.bag_positions import read_measured
 
 LARGEST_MISFIT: Final = (

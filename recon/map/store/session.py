@@ -37,9 +37,9 @@ from recon.odometry.health import trusted_poses
 from recon.odometry.protocol import OdometryHealth
 from recon.places.closure import Closure
 from recon.places.detector import StoredKeyframe
-from recon.places.fixes import NO_FIXES, Fixes
 from recon.places.keyframe import Keyframe
-from recon.places.loop import Loop
+from recon.places.places import Loop
+from recon.places.pose_graph import NO_FIXES, Fixes
 
 SESSION: Final = "session"
 AXES: Final = "axes"

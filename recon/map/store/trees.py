@@ -31,7 +31,7 @@ from recon.look.fault import active
 from recon.look.fit import FittedFault
 from recon.look.rig import KnownRig
 from recon.odometry.protocol import OdometryHealth
-from recon.places.loop import Loop
+from recon.places.places import Loop
 from recon.stereo.rectify.epipolar import as_raw
 
 Bytes = bytes | bytearray | memoryview

@@ -24,27 +24,16 @@ RIDGE: Final = 1e-9
 
 
 class BundleModel(NamedTuple):
-    """How a point is seen, and how much its observations count.
+    """How a point is seen, and how much its observations count."""
 
-    Attributes:
-        focal: Focal length, pixels.
-        cx: Column of the principal point.
-        cy: Row of the principal point.
-        fb: Focal length times baseline.
-        doffs: Difference of the principal points, pixels.
-        sigma_uv: Standard deviation of a column and a row.
-        sigma_d: Standard deviation of a disparity.
-        cauchy: Residual in standard deviations at which an observation counts half.
-    """
-
-    focal: float
-    cx: float
-    cy: float
-    fb: float
-    doffs: float
-    sigma_uv: float
-    sigma_d: float
-    cauchy: float
+    focal: float  # focal length, pixels
+    cx: float  # column of the principal point
+    cy: float  # row of the principal point
+    fb: float  # focal length times baseline
+    doffs: float  # difference of the principal points, pixels
+    sigma_uv: float  # standard deviation of a column and a row
+    sigma_d: float  # standard deviation of a disparity
+    cauchy: float  # residual in standard deviations at which an observation counts half
 
 
 class NormalEquations(NamedTuple):
@@ -190,10 +179,7 @@ def _linearise(
 
 @kernel
 def _solve(
-    normal: tuple[Float64, ...],
-    damping: float,
-    step_pose: Float64,
-    step_point: Float64,
+    normal: tuple[Float64, ...], damping: float, step_pose: Float64, step_point: Float64
 ) -> None:
     """Schur complement: the system of the poses, then the points one by one."""
     H_pose, g_pose, H_point, g_point, H_cross = normal

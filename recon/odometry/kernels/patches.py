@@ -1,9 +1,10 @@
 """Patches of one image, found again in another that shows them larger, smaller or slanted.
 
-Where a camera drives up to a feature its patch grows, and one on the road is slanted, too. A motion and a
-depth say how; with the patch warped accordingly, only its place is left to be found.
+Where a camera drives up to a feature its patch grows, and one on the road slants too. A motion and
+a depth say how; with the patch warped accordingly, only its place is left to be found. The slope of
+the surface that a feature is on is fitted to the disparities around it.
 
-The reference implementation in plain numpy is `tests/odometry/kernels/test_patches.py`.
+The reference implementations in plain numpy are in `tests/odometry/kernels/`.
 """
 
 from __future__ import annotations
@@ -14,9 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import kernel
+from recon.core.kernels.compiled import Float32, Float64, kernel
 
-Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
 LEAST_POWER: Final = 1.0
@@ -27,19 +27,12 @@ _FLAT: Final = 1e-9
 
 
 class Placing(NamedTuple):
-    """How patches are placed.
+    """How patches are placed."""
 
-    Attributes:
-        radius: Half width of a patch, pixels.
-        steps: Gauss-Newton steps at most.
-        close: Length of a step, pixels, below which it is the last.
-        reach: Largest distance between the guess and the place, pixels, along either axis.
-    """
-
-    radius: int
-    steps: int
-    close: float
-    reach: float
+    radius: int  # half width of a patch, pixels
+    steps: int  # Gauss-Newton steps at most
+    close: float  # length of a step, pixels, below which it is the last
+    reach: float  # largest distance between the guess and the place, pixels, along either axis
 
 
 def place_patches(
@@ -191,3 +184,67 @@ def _dot(one: Float64, other: Float64) -> float:
         for j in range(one.shape[1]):
             total += one[i, j] * other[i, j]
     return total
+
+
+_RIDGE: Final = 1.0  # squared pixels: neighbours in one line fix no slope across it
+
+
+class Surface(NamedTuple):
+    """What counts as of one surface."""
+
+    radius: int  # half width of the neighbourhood, pixels
+    step: int  # every so many rows and columns of it are looked at
+    near: float  # largest distance of a neighbour from the plane, in disparity
+    least: int  # neighbours on the plane, with fewer of which it counts as upright
+    rounds: int  # fits, each to the neighbours that are on the last plane
+
+
+def fit_slopes(values: Float32, uv: Float64, surface: Surface) -> Float64:
+    """Fit planes to disparities (H, W) around features (N, 2); NaN = unknown.
+
+    Returns:
+        float64 (N, 2), change of the disparity per pixel right and down; 0 where too few are on the
+        plane.
+    """
+    slopes = np.zeros((len(uv), 2))
+    radius, step, near, least, rounds = surface
+    plain = (radius, step, near, least, rounds)  # numba's cache would remember the class by name
+    _fit_all(values, uv, plain, slopes)
+    return slopes
+
+
+@kernel
+def _fit_all(
+    values: Float32, uv: Float64, surface: tuple[int, int, float, int, int], slopes: Float64
+) -> None:
+    radius, step, near, least, rounds = surface
+    height, width = values.shape
+    for n in range(len(uv)):
+        column, row = int(np.rint(uv[n, 0])), int(np.rint(uv[n, 1]))
+        at = values[min(max(row, 0), height - 1), min(max(column, 0), width - 1)]
+        middle, right, down = np.float64(at), 0.0, 0.0
+        for _ in range(rounds):
+            number, x, y, xx, yy, xy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            d, xd, yd = 0.0, 0.0, 0.0
+            for v in range(-radius, radius + 1, step):
+                for u in range(-radius, radius + 1, step):
+                    if not (0 <= row + v < height and 0 <= column + u < width):
+                        continue
+                    value = np.float64(values[row + v, column + u])
+                    # A comparison with NaN is False.
+                    if abs(value - (middle + right * u + down * v)) <= near:
+                        number += 1.0
+                        x, y, d = x + u, y + v, d + value
+                        xx, yy, xy = xx + u * u, yy + v * v, xy + u * v
+                        xd, yd = xd + u * value, yd + v * value
+            if number < least:
+                right, down = 0.0, 0.0
+                continue
+            a, c = xx + _RIDGE - x * x / number, yy + _RIDGE - y * y / number
+            b = xy - x * y / number
+            along, across = xd - x * d / number, yd - y * d / number
+            determinant = a * c - b * b
+            right = (c * along - b * across) / determinant
+            down = (a * across - b * along) / determinant
+            middle = (d - x * right - y * down) / number
+        slopes[n, 0], slopes[n, 1] = right, down

@@ -1,6 +1,6 @@
 """Sums of absolute differences over a window, and the best candidate of each pixel.
 
-Why it is fast: a tile of the image is offered only some candidates (`tiles`). The inner loops
+Why it is fast: a tile of the image is offered only some candidates (`Tiles`). The inner loops
 work on `LANES` neighbouring columns at once (`simd`), with the best so far in registers. A window
 consists of two halves (`half_windows`), each of which is summed once for two rows, in blocks of
 columns that stay in a core's own cache. Two halves that are shifted against each other make a
@@ -22,6 +22,7 @@ from recon.stereo.kernels.half_windows import (
     Halves,
     Scratch,
     Search,
+    Tiles,
     Views,
     next_half,
     offer_candidates,
@@ -38,7 +39,6 @@ from recon.stereo.kernels.simd.vectors import (
     where_equal,
     where_less,
 )
-from recon.stereo.kernels.tiles import Tiles
 
 Found: TypeAlias = tuple[Vector, Vector, Vector, Vector, Vector, Vector, Vector, Vector]
 """The best so far in `LANES` columns; see `_weigh`."""

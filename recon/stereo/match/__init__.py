@@ -4,8 +4,8 @@
 also finds a range where none is known, and rough disparities at half size; its costs are in
 `kernels/half_windows.py`, those of `sgm.py` in `kernels/path_costs.py`. Of both,
 `kernels/refine.py` checks what was found, and says why a pixel has no disparity. `fine.py` adds
-costs that a network knows (`features.py`) and a search among planes (`kernels/planes.py`), also
-those of whole segments (`segments.py`), with which `fill.py` fills what any matcher did not find.
-`onnx.py` runs the networks (`network.py`) of others (`presets.py`): `self_test.py` has the pair
-that they must match first, `tiles.py` cuts large images, `agreement.py` rates what both views find.
+costs that a network knows (`kernels/convolution.py`) and a search among planes
+(`kernels/planes.py`), also those of whole segments, with which `fill.py` fills what any matcher did
+not find. `onnx.py` runs the networks of others (`network.py`), rates what both views find, and says
+what is known of those that are published.
 """

@@ -1,9 +1,14 @@
-"""A learned matcher: a network that the user supplies as an ONNX file."""
+"""A learned matcher: a network that the user supplies as an ONNX file.
+
+Of networks that others publish it is said what to get, its licence, and how it is fed: only what
+their authors or the file itself state. No checksum is known of an ONNX file of theirs: the one of
+the file that was given is recorded with each result.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -15,14 +20,11 @@ from typing_extensions import Self
 from recon.core.errors import MatchingError, SettingsError
 from recon.core.settings import Settings
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.core.values.arrays import Float32, UInt8
-from recon.stereo.match.agreement import rate_by_agreement
-from recon.stereo.match.network import LARGEST_PX, OnnxNetwork
-from recon.stereo.match.presets import OWN, PRESETS, Preset
+from recon.core.values.arrays import Bool, Float32, UInt8
+from recon.core.values.image import ASSUMED_SIGMA_PX
+from recon.stereo.match.network import LARGEST_PX, OnnxNetwork, check_network, match_in_tiles
 from recon.stereo.match.protocol import unrated_disparity
 from recon.stereo.match.search import LEFT_RIGHT_PX, usual_ndisp
-from recon.stereo.match.self_test import check_network
-from recon.stereo.match.tiles import match_in_tiles
 
 _WHITE: Final = 255.0
 Size = tuple[int, int]  # width and height
@@ -158,17 +160,14 @@ class OnnxMatcher:
         views = _fitted(left, size, multiple), _fitted(right, size, multiple)
 
         def match(*views: UInt8) -> Float32:
-            return self._run(network, views)
+            inputs = [_tensor(view, network.channels, self._use) for view in views]
+            if network.stacked:
+                inputs = [np.concatenate(inputs, axis=1)]
+            return _resized(self._disparity_of(network.run(inputs)), views[0].shape[:2])
 
         most = int(1e6 * self._settings.tile_megapixels) if size is None else views[0].size
         values = match_in_tiles(match, views, reach_px, most, multiple)
         return values[:height, :width] if size is None else _resized(values, (height, width))
-
-    def _run(self, network: OnnxNetwork, views: tuple[UInt8, ...]) -> Float32:
-        inputs = [_tensor(view, network.channels, self._use) for view in views]
-        if network.stacked:
-            inputs = [np.concatenate(inputs, axis=1)]
-        return _resized(self._disparity_of(network.run(inputs)), views[0].shape[:2])
 
     def _disparity_of(self, outputs: list[Float32]) -> Float32:
         """Return float32 (h, w), pixels of what was put in, NaN = none."""
@@ -214,3 +213,98 @@ def _tensor(image: UInt8, channels: int, use: Preset) -> Float32:
     levels = image.astype(np.float32) / np.float32(_WHITE)
     planes = levels.transpose(2, 0, 1) if image.ndim == 3 else levels[None].repeat(channels, axis=0)
     return np.asarray((planes - mean) / std, dtype=np.float32)[None]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One published network; the settings of `OnnxSettings` that are not set are its."""
+
+    get: str  # which file, and where
+    licence: str  # and where it is stated
+    trained_on: str
+    layout: str = "2 inputs of 3 channels"  # `OnnxNetwork.layout`
+    mean: tuple[float, ...] = (0.0,)
+    std: tuple[float, ...] = (1.0,)
+    output: int = -1
+    output_scale: float = 1.0
+    multiple_px: int = 32
+
+
+#: Of a network that no preset describes.
+OWN: Final = Preset("", "not known", "not known", layout="")
+
+PRESETS: Final = {
+    # Ref: Tankovich et al., "HITNet: Hierarchical iterative tile refinement network for real-time
+    # stereo matching", CVPR 2021. Grey levels in [0, 1], both images in one input.
+    "hitnet": Preset(
+        get="hitnet_eth3d_480x640.onnx of github.com/nburrus/stereodemo, release v0.1-hitnet",
+        licence="Apache-2.0 (that of the sources in google-research; none is stated for weights)",
+        trained_on="ETH3D, by its name; its authors do not state what else",
+        layout="1 input of 2 channels",
+    ),
+    # Ref: Jing et al., "Lite Any Stereo: Efficient zero-shot stereo matching", CVPR 2026. Levels in
+    # [0, 255], which it normalises itself.
+    "lite-any-stereo": Preset(
+        get="LiteAnyStereo.pth of github.com/TomTomTommi/LiteAnyStereo, exported with its "
+        "export_onnx.py --version las1",
+        licence="MIT (LICENSE of github.com/TomTomTommi/LiteAnyStereo)",
+        trained_on="synthetic sets and pairs without truth, named in arXiv:2511.16555; not those "
+        "of Middlebury, ETH3D and KITTI, by its authors",
+        std=(1 / 255,),
+    ),
+}
+
+
+_WINDOW_PX: Final = 7  # in which the disagreement of both views is averaged
+#: Odds of a match to be right to a pixel, at a disagreement of one pixel, and how they fall with
+#: it: fitted on seven scenes of MiddEval3 with the features of `fine`, a cost volume of their
+#: products and a soft minimum. Networks that are wrong in the same way in both views are surer.
+_ODDS, _POWER = 0.9, 1.6
+_LEAST_PX: Final = 0.05  # a smaller disagreement says no more
+
+
+def rate_by_agreement(
+    values: Float32, of_right: Float32, pair: RectifiedPair, limit_px: float
+) -> Disparity:
+    """Return a disparity map whose confidence and sigma follow from how well both views agree.
+
+    Args:
+        values: float32 (H, W), disparity of the left view, px; NaN = none.
+        of_right: float32 (H, W), that of the right view, ``x_left - x_right`` of its pixels too.
+        pair: The images.
+        limit_px: Matches that differ by more are removed: as OCCLUDED where no pixel of the right
+            view is matched with them, else as LEFT_RIGHT.
+    """
+    rows, columns = np.mgrid[: values.shape[0], : values.shape[1]].astype(np.float32)
+    there = np.where(np.isfinite(values), columns - values, np.float32(-2))
+    sampled = cv2.remap(
+        of_right, there, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+    )
+    apart = np.abs(values - np.asarray(sampled, dtype=np.float32))
+    agree = apart <= limit_px  # not where either is NaN
+    reason = np.where(_seen(of_right), np.uint8(Reason.LEFT_RIGHT), np.uint8(Reason.OCCLUDED))
+    reason[agree] = Reason.VALID
+    reason[~np.isfinite(values)] = Reason.AMBIGUOUS
+    found = unrated_disparity(values, reason, pair)
+    capped = np.where(agree, apart, np.float32(limit_px))
+    mean_square = cv2.blur(capped * capped, (_WINDOW_PX, _WINDOW_PX))
+    odds = _ODDS * np.maximum(np.sqrt(mean_square), _LEAST_PX) ** -_POWER
+    sure = np.asarray(odds / (1 + odds), dtype=np.float32)
+    # The difference of two estimates has twice the variance of each.
+    sigma = np.sqrt(ASSUMED_SIGMA_PX**2 + mean_square / 2)
+    both = np.sqrt(sure * sigma**2 + (1 - sure) * np.maximum(sigma, 1) ** 2)
+    return replace(
+        found,
+        confidence=np.where(found.valid, sure, 0).astype(np.float32),
+        sigma_px=np.where(found.valid, both, np.nan).astype(np.float32),
+    )
+
+
+def _seen(of_right: Float32) -> Bool:
+    """Return which pixels of the left view some pixel of the right view is matched with."""
+    height, width = of_right.shape
+    to = np.where(np.isfinite(of_right), np.arange(width) + of_right, -1)
+    to = np.rint(np.clip(to, -1, width)).astype(np.intp) + 1
+    seen = np.zeros((height, width + 2), dtype=np.bool_)
+    seen[np.arange(height)[:, None], to] = True
+    return seen[:, 1:-1]

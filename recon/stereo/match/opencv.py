@@ -54,7 +54,11 @@ class OpencvMatcher:
         s, ndisp = self._settings, _range(self._settings, pair.camera)
         block_px = s.block_px or (_SGBM_BLOCK_PX if self._semi_global else _BM_BLOCK_PX)
         make = _semi_global_engine if self._semi_global else _block_engine
-        return _match(pair, make(s, ndisp, block_px), s, _sides(s, block_px, ndisp))
+        above, before, after = 0, 0, 0
+        if s.pad:  # what OpenCV leaves out
+            above, high = block_px // 2 + 1, s.min_disparity_px + ndisp - 1
+            before, after = above + max(0, high), above + max(0, -s.min_disparity_px)
+        return _match(pair, make(s, ndisp, block_px), s, (above, above, before, after))
 
 
 def _block_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.StereoBM:
@@ -82,23 +86,16 @@ def _semi_global_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.Ste
     )
 
 
-def _sides(s: OpencvSettings, block_px: int, ndisp: int) -> tuple[int, int, int, int]:
-    """Return pixels to add above, below, left and right: what OpenCV leaves out, or none."""
-    if not s.pad:
-        return 0, 0, 0, 0
-    margin, low, high = block_px // 2 + 1, s.min_disparity_px, s.min_disparity_px + ndisp - 1
-    return margin, margin, margin + max(0, high), margin + max(0, -low)
-
-
 def _match(
     pair: RectifiedPair, engine: Any, s: OpencvSettings, sides: tuple[int, int, int, int]
 ) -> Disparity:
-    """Let OpenCV match; it does not report which check rejects a pixel: those are AMBIGUOUS."""
+    """Let OpenCV match images widened above, below, left and right by so many pixels.
+
+    It does not report which check rejects a pixel: those are AMBIGUOUS.
+    """
     try:
-        wide = (
-            cv2.copyMakeBorder(v, *sides, cv2.BORDER_REPLICATE) for v in (pair.left, pair.right)
-        )
-        raw = engine.compute(*wide)
+        views = (pair.left, pair.right)
+        raw = engine.compute(*(cv2.copyMakeBorder(v, *sides, cv2.BORDER_REPLICATE) for v in views))
     except cv2.error as error:
         got = f"{pair.camera.width_px}x{pair.camera.height_px}: {error.err[:200]}"
         what = "OpenCV cannot match this pair with these settings"

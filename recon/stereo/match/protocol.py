@@ -54,25 +54,20 @@ class CheckedMatcher:
         self._name = name
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        with calling(MatchingError, "the matcher fails", where=f"matcher {self._name!r}"):
+        where = f"matcher {self._name!r}"
+        with calling(MatchingError, "the matcher fails", where=where):
             found = self._matcher.match(pair)
-        disparity = _checked(found, pair, self._name)
-        return disparity if pair.valid is None else disparity.reject(~pair.valid, Reason.BORDER)
-
-
-def _checked(found: Any, pair: RectifiedPair, name: str) -> Disparity:
-    if not isinstance(found, Disparity):
-        raise MatchingError(
-            "the matcher returns no Disparity",
-            where=f"matcher {name!r}",
-            got=kind_of(found),
-            hint="return recon.Disparity.from_values(array)",
-        )
-    problem = _problem(found, pair)
-    if problem is not None:
-        what, got, expected = problem
-        raise MatchingError(what, where=f"matcher {name!r}", got=got, expected=expected)
-    return found
+        if not isinstance(found, Disparity):
+            what, hint = (
+                "the matcher returns no Disparity",
+                "return recon.Disparity.from_values(array)",
+            )
+            raise MatchingError(what, where=where, got=kind_of(found), hint=hint)
+        problem = _problem(found, pair)
+        if problem is not None:
+            what, got, expected = problem
+            raise MatchingError(what, where=where, got=got, expected=expected)
+        return found if pair.valid is None else found.reject(~pair.valid, Reason.BORDER)
 
 
 def _problem(found: Disparity, pair: RectifiedPair) -> tuple[str, str, str] | None:

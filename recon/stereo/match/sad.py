@@ -15,19 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
+from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
 from recon.stereo.kernels.half_windows import (
     Search,
+    Support,
+    Tiles,
     empty_scratch,
     empty_views,
     lay_out,
+    make_tiles,
+    offer_supported,
     widest_block,
 )
 from recon.stereo.kernels.minima import empty_minima
 from recon.stereo.kernels.refine import REFINED_BYTES, Refined, Rules, refine_minima, refined_in
 from recon.stereo.kernels.sad import sad_minima
-from recon.stereo.kernels.tiles import Support, Tiles, make_tiles, offer_supported
 from recon.stereo.match import search as common
 from recon.stereo.match.protocol import Matcher
 
@@ -79,8 +82,12 @@ class SadMatcher:
         self._half = _StripSearch(self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        search, rules = self._plan(pair.camera)
         s = self._settings
+        ndisp, radius = s.ndisp_within(pair.camera), s.window_px // 2
+        # The middles of the two halves lie half a radius above and below the pixel.
+        slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
+        search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
+        rules = common.rules_of(s, ndisp, s.window_px**2, min_texture=_MIN_TEXTURE)
         with ThreadPoolExecutor(self._threads) as pool:
             enough = partial(common.texture, pair, s.window_px)
             tiles = self._tiles(pool, pair, search)
@@ -90,30 +97,26 @@ class SadMatcher:
     def _tiles(self, pool: Executor, pair: RectifiedPair, search: Search) -> Tiles:
         if search.ndisp < LEAST_NDISP:
             return undivided(search, pair.left.shape)
-        halved = half_search(search)
+        minimum = search.minimum // 2
+        ndisp = -(-(search.minimum + search.ndisp) // 2) - minimum
+        halved = Search(ndisp, minimum, RADIUS_PX, RADIUS_PX, search.cost_cap, slant=0)
         views = halve(pair.left), halve(pair.right)
         shape = views[0].shape
         valid = None if pair.valid is None else pair.valid[::2, ::2]
         asked = partial(common.no_texture, shape[1], valid)
-        whole, rules = undivided(halved, shape), half_rules(halved)
+        # What makes a match at half size reliable.
+        own = SadSettings(min_disparity_px=minimum, uniqueness_percent=UNIQUENESS_PERCENT)
+        rules = common.rules_of(own, ndisp, (2 * RADIUS_PX + 1) ** 2)._replace(fit=False)
+        whole = undivided(halved, shape)
         found = self._half.find(pool, views, halved, whole, rules, asked)
         tiles = divided(search, pair.left.shape)
-        values, minimum, ndisp = found.values, search.minimum, search.ndisp
+        where = found.values, search.minimum, search.ndisp, SUPPORT
 
         def offer(rows: range) -> None:
-            offer_supported(values, minimum, ndisp, SUPPORT, rows.start, rows.stop, tiles)
+            offer_supported(*where, rows.start, rows.stop, tiles)
 
         common.in_strips(pool, self._threads, offer, len(tiles.offered))
         return tiles
-
-    def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
-        s = self._settings
-        ndisp = s.ndisp_within(camera)
-        radius = s.window_px // 2
-        # The middles of the two halves lie half a radius above and below the pixel.
-        slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
-        search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
-        return search, common.rules_of(s, ndisp, s.window_px**2, min_texture=_MIN_TEXTURE)
 
 
 class _StripSearch:
@@ -168,19 +171,6 @@ def halve(image: UInt8) -> UInt8:
     return np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def half_search(search: Search) -> Search:
-    """Return what to search at half size."""
-    minimum = search.minimum // 2
-    ndisp = -(-(search.minimum + search.ndisp) // 2) - minimum
-    return Search(ndisp, minimum, RADIUS_PX, RADIUS_PX, search.cost_cap, slant=0)
-
-
-def half_rules(search: Search) -> Rules:
-    """Return what makes a match of a search at half size reliable."""
-    asked = SadSettings(min_disparity_px=search.minimum, uniqueness_percent=UNIQUENESS_PERCENT)
-    return common.rules_of(asked, search.ndisp, (2 * RADIUS_PX + 1) ** 2)._replace(fit=False)
-
-
 def undivided(search: Search, shape: tuple[int, int]) -> Tiles:
     """Return one tile from top to bottom, offered everything, as wide as is fast."""
     return make_tiles(shape, (shape[0], widest_block(search, shape[1])), search.ndisp)
@@ -226,22 +216,19 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     usual = common.usual_ndisp(width)
     if width // factor < 6 or height < factor:
         return usual
+    size = width // factor, height // factor
+    camera = replace(pair.camera.resized(*size), ndisp=size[0] // 2)
+    wholes = (im[: size[1] * factor, : size[0] * factor] for im in (pair.left, pair.right))
+    left, right = (cv2.resize(whole, size, interpolation=cv2.INTER_AREA) for whole in wholes)
+    small = RectifiedPair(np.asarray(left, np.uint8), np.asarray(right, np.uint8), camera)
     settings = SadSettings(window_px=7, uniqueness_percent=10)
-    found = SadMatcher(settings, threads=1, average=False).match(_smaller(pair, factor))
+    found = SadMatcher(settings, threads=1, average=False).match(small)
     trusted = found.values[found.valid & (found.confidence >= _CONFIDENCE)]
     if trusted.size < _LEAST_MATCHES:
         return usual
     nearest_px = factor * (1.1 * float(np.percentile(trusted, _SHARE)) + 1.0)
     needed = min(nearest_px, width) - minimum_px + 1
     return max(usual, _STEP * int(np.ceil(needed / _STEP)))
-
-
-def _smaller(pair: RectifiedPair, factor: int) -> RectifiedPair:
-    width, height = size = pair.left.shape[1] // factor, pair.left.shape[0] // factor
-    camera = replace(pair.camera.resized(width, height), ndisp=width // 2)
-    wholes = (image[: height * factor, : width * factor] for image in (pair.left, pair.right))
-    left, right = (cv2.resize(whole, size, interpolation=cv2.INTER_AREA) for whole in wholes)
-    return RectifiedPair(np.asarray(left, np.uint8), np.asarray(right, np.uint8), camera)
 
 
 Number = TypeVar("Number", np.float32, np.uint8)
@@ -266,25 +253,18 @@ class HalfSizeMatcher:
         self._matcher: Matcher = sad if half.ndisp else AutoRangeMatcher(sad, half.min_disparity_px)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        return _enlarged(self._matcher.match(_half(pair)), pair.left.shape)
-
-
-def _half(pair: RectifiedPair) -> RectifiedPair:
-    left, right = halve(pair.left), halve(pair.right)
-    height, width = left.shape
-    camera = pair.camera.resized(width, height)
-    valid = None if pair.valid is None else pair.valid[::2, ::2]
-    return RectifiedPair(left, right, camera, valid=valid)
-
-
-def _enlarged(found: Disparity, shape: tuple[int, ...]) -> Disparity:
-    return replace(
-        found,
-        values=_repeated(2 * found.values, shape),
-        confidence=_repeated(found.confidence, shape),
-        sigma_px=_repeated(2 * found.sigma_px, shape),
-        reason=_repeated(found.reason, shape),
-    )
+        left, right = halve(pair.left), halve(pair.right)
+        camera = pair.camera.resized(left.shape[1], left.shape[0])
+        valid = None if pair.valid is None else pair.valid[::2, ::2]
+        found = self._matcher.match(RectifiedPair(left, right, camera, valid=valid))
+        shape = pair.left.shape
+        return replace(
+            found,
+            values=_repeated(2 * found.values, shape),
+            confidence=_repeated(found.confidence, shape),
+            sigma_px=_repeated(2 * found.sigma_px, shape),
+            reason=_repeated(found.reason, shape),
+        )
 
 
 def _repeated(values: NDArray[Number], shape: tuple[int, ...]) -> NDArray[Number]:

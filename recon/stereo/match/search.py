@@ -125,19 +125,15 @@ def finish(refined: Refined, pool: Executor, threads: int, *, average: bool = Tr
     small = find_speckles(refined.values, _SPECKLE_STEP_PX, _SPECKLE_SIZE_PX)
     # A plain number: to look up what an enumeration is takes numba 0.2 ms.
     reject(small, int(Reason.SPECKLE), refined)
-    if average:
-        refined = refined._replace(values=_averaged(refined.values, pool, threads))
-    return Disparity(*refined)
+    if not average:
+        return Disparity(*refined)
+    averages, how = np.empty_like(refined.values), (_AVERAGE_PX // 2, _SAME_SURFACE_PX)
 
+    def average_rows(rows: range) -> None:
+        average_opposite(refined.values, *how, rows.start, rows.stop, averages)
 
-def _averaged(values: Float32, pool: Executor, threads: int) -> Float32:
-    averages, radius = np.empty_like(values), _AVERAGE_PX // 2
-
-    def average(rows: range) -> None:
-        average_opposite(values, radius, _SAME_SURFACE_PX, rows.start, rows.stop, averages)
-
-    in_strips(pool, threads, average, len(values))
-    return averages
+    in_strips(pool, threads, average_rows, len(averages))
+    return Disparity(*refined._replace(values=averages))
 
 
 def in_strips(pool: Executor, threads: int, work: Callable[[range], None], rows: int) -> None:

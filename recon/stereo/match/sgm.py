@@ -16,7 +16,6 @@ from recon.stereo.kernels.minima import empty_minima
 from recon.stereo.kernels.path_costs import (
     CENSUS_RADIUS,
     Views,
-    Window,
     WriteCosts,
     empty_planes,
     scaled_window,
@@ -87,11 +86,17 @@ class SgmMatcher:
     def match(self, pair: RectifiedPair) -> Disparity:
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
-        window, size = _window(s), pair.left.shape
+        window = scaled_window(
+            radius=s.window_px // 2,
+            rows_radius=s.window_px // 2,
+            gradient_cap=COST_CAP,
+            largest=LARGEST_COST,
+            levels=LEVELS / (LARGEST_COST + s.p1 + s.p2),
+        )
         paths = paths_of(ndisp, s.min_disparity_px, s.p1, s.p2, window.levels)
         # A cost is about so many times the mean cost of a pixel.
         rules = common.rules_of(s, ndisp, max(1, round(PARTS * window.levels)), odds=ODDS)
-        with self._planes.borrow(*size, window.radius, ndisp) as planes:
+        with self._planes.borrow(*pair.left.shape, window.radius, ndisp) as planes:
             views = Views(pair.left, *planes)
 
             def prepare(strip: range) -> None:
@@ -134,31 +139,16 @@ class PathSearch:
             enough = common.no_texture(size[1], pair.valid, strip)
             refine_minima(minima, enough, rules, strip.start, strip.stop, refined)
 
-        strips, at_once = self._strips(size[0], size[1], paths)
+        # An even number of strips keeps two cores busy to the end.
+        rows = -(-size[0] // (2 * -(-size[0] // (2 * _STRIP_ROWS))))
+        strips = [range(y, min(y + rows, size[0])) for y in range(0, size[0], rows)]
+        bytes_each = scratch_bytes(band_columns(size[1], paths), paths)
+        at_once = max(1, min(self._threads, _MEMORY_BYTES // bytes_each))
         with self._minima.borrow(*size) as minima, ThreadPoolExecutor(at_once) as pool:
             if prepare is not None:
                 list(pool.map(prepare, strips))
             list(pool.map(search, strips))
             return common.finish(refined, pool, at_once)
-
-    def _strips(self, height: int, width: int, paths: Paths) -> tuple[list[range], int]:
-        # An even number of strips keeps two cores busy to the end.
-        rows = -(-height // (2 * -(-height // (2 * _STRIP_ROWS))))
-        bytes_each = scratch_bytes(band_columns(width, paths), paths)
-        at_once = min(self._threads, _MEMORY_BYTES // bytes_each)
-        strips = [range(y, min(y + rows, height)) for y in range(0, height, rows)]
-        return strips, max(1, at_once)
-
-
-def _window(settings: SgmSettings) -> Window:
-    s = settings
-    return scaled_window(
-        radius=s.window_px // 2,
-        rows_radius=s.window_px // 2,
-        gradient_cap=COST_CAP,
-        largest=LARGEST_COST,
-        levels=LEVELS / (LARGEST_COST + s.p1 + s.p2),
-    )
 
 
 def paths_of(ndisp: int, minimum: int, p1: float, p2: float, levels: float) -> Paths:

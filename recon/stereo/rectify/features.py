@@ -202,7 +202,6 @@ class PairInspection:
 
     features: int  # number of matched features that agree on one epipolar error
     epipolar_error_px: float  # median of right minus left row; 0 if the rows are aligned
-    row_spread_px: float  # robust standard deviation of that (from the median absolute deviation)
     near: int  # number of features near enough to show whether the cameras are swapped
     #: Fraction of those with a negative disparity: about 0, or about 1 if the cameras are swapped.
     negative_ratio: float
@@ -227,10 +226,9 @@ def inspect_features(
     near = np.abs(disparity) > _NEAR_PX
     known = len(rows) >= min_features
     middle = float(np.median(rows)) if known else float("nan")
-    spread = 1.4826 * float(np.median(np.abs(rows - middle))) if known else float("nan")
     enough = near.sum() >= min_features
     negative = float(np.mean(disparity[near] < 0)) if enough else float("nan")
-    return PairInspection(len(rows), middle, spread, int(near.sum()), negative)
+    return PairInspection(len(rows), middle, int(near.sum()), negative)
 
 
 def check_inspection(inspection: PairInspection, where: str | None = None) -> tuple[str, ...]:

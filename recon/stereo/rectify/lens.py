@@ -106,22 +106,16 @@ def rectifying_maps(
     matrix, ``size`` its (width, height).
     """
     if camera.model != "fisheye" and not sees_all(camera):
-        return _without_folds(camera, rotation, matrix, size)
+        # The lens model folds back into the image: where it does, the tables are (-1, -1).
+        x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+        rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float64)
+        xyz = (np.linalg.inv(rotation) @ np.linalg.inv(matrix[:, :3]) @ rays).T
+        pixels = np.nan_to_num(project_into_image(camera, xyz), nan=-1.0).astype(np.float32)
+        return pixels[:, 0].reshape(x.shape), pixels[:, 1].reshape(x.shape)
     model: Any = cv2.fisheye if camera.model == "fisheye" else cv2
     raw, distortion, K = (np.array(a) for a in (camera.matrix, camera.distortion, matrix[:, :3]))
     maps = model.initUndistortRectifyMap(raw, distortion, rotation, K, size, cv2.CV_32FC1)
     return np.asarray(maps[0]), np.asarray(maps[1])
-
-
-def _without_folds(
-    camera: CameraIntrinsics, rotation: Float64, matrix: Float64, size: tuple[int, int]
-) -> tuple[Float32, Float32]:
-    """Return remap tables that are (-1, -1) where the lens model folds back into the image."""
-    x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
-    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float64)
-    xyz = (np.linalg.inv(rotation) @ np.linalg.inv(matrix[:, :3]) @ rays).T
-    pixels = np.nan_to_num(project_into_image(camera, xyz), nan=-1.0).astype(np.float32)
-    return pixels[:, 0].reshape(x.shape), pixels[:, 1].reshape(x.shape)
 
 
 # Depths along a ray, in baselines: from nearer than any rig measures to practically infinity.

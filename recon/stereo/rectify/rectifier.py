@@ -77,7 +77,9 @@ class Rectifier:
         if isinstance(calibration, RectifiedCamera):
             self.camera = calibration
             return
-        self.camera, self._views = plan_rectification(calibration, self.settings)
+        turns = plan_turns(calibration, self.settings)
+        self.camera = turns.camera
+        self._views = _remap_tables(calibration, turns)
         self.valid = self._views[0].inside
         self.valid.flags.writeable = False
         if not (self.valid.any() and self._views[1].inside.any()):
@@ -159,11 +161,9 @@ def turns_of(rig: Rig, settings: RectificationSettings) -> RectifyingTurns:
     return RectifyingTurns(np.eye(3), np.eye(3), rig)
 
 
-def plan_rectification(
-    calibration: StereoCalibration, settings: RectificationSettings
-) -> tuple[RectifiedCamera, tuple[RemapTables, RemapTables]]:
-    """Compute the rectified camera and the remap tables of its left and right view."""
-    turns = plan_turns(calibration, settings)
+def _remap_tables(
+    calibration: StereoCalibration, turns: RectifyingTurns
+) -> tuple[RemapTables, RemapTables]:
     size = (turns.camera.width_px, turns.camera.height_px)
     cameras, rotations = (calibration.left, calibration.right), (turns.R_left, turns.R_right)
     try:
@@ -173,7 +173,7 @@ def plan_rectification(
         )
     except cv2.error as error:
         raise CalibrationError("cameras cannot be rectified", got=error.err) from error
-    return turns.camera, (left, right)
+    return left, right
 
 
 def _bouguet(
@@ -183,9 +183,8 @@ def _bouguet(
     cameras, T = (calibration.left, calibration.right), calibration.T_right_left
     size = (cameras[0].width_px, cameras[0].height_px)
     K_left, K_right = (camera.matrix for camera in cameras)
-    return cv2.stereoRectify(K_left, left, K_right, right, size, T[:3, :3], T[:3, 3:], alpha=alpha)[
-        :4
-    ]
+    R, t = T[:3, :3], T[:3, 3:]
+    return cv2.stereoRectify(K_left, left, K_right, right, size, R, t, alpha=alpha)[:4]
 
 
 def _with_field(camera: RectifiedCamera, field_of_view_deg: float | None) -> RectifiedCamera:
@@ -251,7 +250,12 @@ def plan_wide_view(calibration: StereoCalibration, alpha: float | None) -> Seque
     R_left, R_right, P_left, P_right = _bouguet(calibration, None, None, -1)
     boxes = np.array([_boxes(left, R_left), _boxes(right, R_right)])
     inner, outer = zip(boxes[:, :, 0].max(axis=0), boxes[:, :, 1].min(axis=0), strict=True)
-    focal = _focal(inner, outer, size, alpha, float(left.matrix[0, 0]))
+    focal = raw_px = float(left.matrix[0, 0])
+    if alpha is not None:
+        pixels = np.array(size) - 1.0
+        zoomed = max(raw_px, float((pixels / np.maximum(inner[1] - inner[0], 1e-6)).max()))
+        whole = float((pixels / np.maximum(outer[1] - outer[0], 1e-6)).min())
+        focal = zoomed * (1 - alpha) + whole * alpha
     x, y = (inner[0] + inner[1]) / 2
     for P in (P_left, P_right):
         P[0, 0] = P[1, 1] = focal
@@ -282,17 +286,6 @@ def _flat(camera: CameraIntrinsics, rotation: Float64, pixels: Float64) -> Float
     turned = np.where(np.isfinite(plane), plane, outward) @ rotation.T
     z = np.maximum(turned[:, 2:], 1e-3)
     return np.asarray(np.clip(turned[:, :2] / z, -_WIDEST, _WIDEST))
-
-
-def _focal(
-    inner: Box, outer: Box, size: tuple[int, int], alpha: float | None, raw_px: float
-) -> float:
-    if alpha is None:
-        return raw_px
-    pixels = np.array(size) - 1.0
-    zoomed = max(raw_px, float((pixels / np.maximum(inner[1] - inner[0], 1e-6)).max()))
-    whole = float((pixels / np.maximum(outer[1] - outer[0], 1e-6)).min())
-    return zoomed * (1 - alpha) + whole * alpha
 
 
 GreyMode = Literal["bt601", "mean", "paper"]

@@ -8,16 +8,8 @@ from hypothesis import strategies as st
 from recon.core.errors import SettingsError
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
-from recon.map.ground.surface import GroundSurface
-from recon.map.ground.traverse import (
-    UNSURE,
-    Raster,
-    RobotSettings,
-    costs,
-    judge,
-    measure_relief,
-    widened,
-)
+from recon.map.ground.surface import GroundSurface, Raster
+from recon.map.ground.traverse import UNSURE, RobotSettings, costs, judge, measure_relief, widened
 from recon.map.settings import DriveSettings
 from tests.map.walls import T_MAP_WORLD
 

@@ -27,8 +27,8 @@ from recon.map.sessions.copying import check_session, copy_sessions
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
 from recon.map.sessions.placed import PlacedMap, PlacedSubmaps, place_map, place_map_on
 from recon.odometry.protocol import OdometryHealth
-from recon.places.fixes import Fixes
-from recon.places.loop import Loop
+from recon.places.places import Loop
+from recon.places.pose_graph import Fixes
 from tests.map.walls import (
     CONFIG,
     FRAMES,

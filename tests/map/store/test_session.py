@@ -23,7 +23,7 @@ from recon.map.store.trees import Link
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
-from recon.places.loop import Loop
+from recon.places.places import Loop
 from recon.stereo.rectify.epipolar import as_raw
 from tests.map.walls import CAMERA, CONFIG, drives
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.odometry.kernels.slopes import Surface, fit_slopes
+from recon.odometry.kernels.patches import Surface, fit_slopes
 
 SURFACE = Surface(radius=4, step=2, near=1.0, least=6, rounds=3)
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.lib.stride_tricks import sliding_window_view
 
 from recon.stereo.kernels import convolution as kernels
+from recon.stereo.kernels.convolution import TILE, Blend, add_dissimilarity
 from recon.stereo.kernels.simd.vectors import SUMS
-from recon.stereo.kernels.similarity import TILE, Blend, add_dissimilarity
-from recon.stereo.match.features import Describer, load_network
+from recon.stereo.match.fine import Describer, load_network
 
 
 def pairs_of(values: np.ndarray) -> np.ndarray:

@@ -4,27 +4,27 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recon.stereo.kernels import evidence
+from recon.stereo.kernels import filling
 
 
 def nearest_reference(known, y, x, direction):
-    down, right = evidence.STEPS[direction]
+    down, right = filling.STEPS[direction]
     steps = 0
     while True:
         steps += 1
         v, u = y + steps * down, x + steps * right
         if not (0 <= v < known.shape[0] and 0 <= u < known.shape[1]):
-            return evidence.NOWHERE
+            return filling.NOWHERE
         if known[v, u]:
             return steps
 
 
 def weigh_reference(values, distances, plane, y, x, within_px):
     agree, against = [], 0
-    for k, (down, right) in enumerate(evidence.STEPS):
+    for k, (down, right) in enumerate(filling.STEPS):
         steps = int(distances[k, y, x])
         rest = np.inf
-        if steps != evidence.NOWHERE:
+        if steps != filling.NOWHERE:
             dy, dx = steps * down, steps * right
             there = plane[0, y, x] + plane[1, y, x] * dx + plane[2, y, x] * dy
             rest = values[y + dy, x + dx] - there
@@ -32,7 +32,7 @@ def weigh_reference(values, distances, plane, y, x, within_px):
         against += rest < -within_px
     around = "".join("x" if one else "." for one in agree * 2)
     gap = max(map(len, around.split("x")))
-    return sum(agree), against, min(gap, evidence.DIRECTIONS)
+    return sum(agree), against, min(gap, filling.DIRECTIONS)
 
 
 @settings(max_examples=25, deadline=None)
@@ -41,9 +41,9 @@ def test_kernels_are_their_references(seed, height, width):
     rng = np.random.default_rng(seed)
     known = rng.random((height, width)) < 0.4
     values = np.where(known, rng.choice([3.0, 5.0, 9.0], known.shape), np.nan).astype(np.float32)
-    distances = np.empty((evidence.DIRECTIONS, *known.shape), np.uint16)
+    distances = np.empty((filling.DIRECTIONS, *known.shape), np.uint16)
     for direction, of in enumerate(distances):
-        evidence.find_nearest(known, direction, of)
+        filling.find_nearest(known, direction, of)
     for k, y, x in np.ndindex(distances.shape):
         assert distances[k, y, x] == nearest_reference(known, y, x, k)
     planes = rng.choice([4.5, np.nan], (3, *known.shape)).astype(np.float32)
@@ -51,9 +51,9 @@ def test_kernels_are_their_references(seed, height, width):
     wanted, found = rng.random(known.shape) < 0.8, np.empty((3, *known.shape), np.uint8)
     for rows in (range(height // 2), range(height // 2, height)):
         args = values, distances, planes, wanted, 1.0
-        evidence.weigh_planes(*args, rows.start, rows.stop, found)
+        filling.weigh_planes(*args, rows.start, rows.stop, found)
     for y, x in np.ndindex(known.shape):
         asked = wanted[y, x] and np.isfinite(planes[0, y, x])
-        none = (0, 0, evidence.DIRECTIONS)
+        none = (0, 0, filling.DIRECTIONS)
         expected = weigh_reference(values, distances, planes, y, x, 1.0) if asked else none
         assert tuple(found[:, y, x]) == expected

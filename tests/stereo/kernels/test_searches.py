@@ -12,6 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from recon.core.kernels.compiled import Bool, Int64, UInt8, UInt16
 from recon.stereo.kernels import half_windows, semi_global
+from recon.stereo.kernels.half_windows import GROUP, Support, Tiles, make_tiles, offer_supported
 from recon.stereo.kernels.minima import NO_COST, Minima, empty_minima
 from recon.stereo.kernels.path_costs import (
     CENSUS_RADIUS,
@@ -29,7 +30,6 @@ from recon.stereo.kernels.paths import Paths
 from recon.stereo.kernels.plane_minima import PARTS, Band
 from recon.stereo.kernels.sad import sad_minima
 from recon.stereo.kernels.simd.vectors import LANES
-from recon.stereo.kernels.tiles import GROUP, Support, Tiles, make_tiles, offer_supported
 
 Pair = tuple[UInt8, UInt8]
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.stereo.kernels import segments
+from recon.stereo.kernels import filling
 
 DRAWS = np.random.default_rng(0).random((150, 3))
 NONE = -99.0
@@ -13,7 +13,7 @@ NONE = -99.0
 def sorted_by_label(labels):
     starts = np.concatenate([[0], np.cumsum(np.bincount(labels.ravel()))]).astype(np.int64)
     order = np.empty(labels.size, np.int64)
-    segments.sort_by_label(labels.ravel().astype(np.int32), starts, order)
+    filling.sort_by_label(labels.ravel().astype(np.int32), starts, order)
     return order, starts
 
 
@@ -22,7 +22,7 @@ def fitted(values, labels, wanted, weights=None):
     planes = np.full((3, *values.shape), NONE, np.float32)
     order, starts = sorted_by_label(labels)
     given_ = values, weights, order, starts, np.array(wanted, np.int64), DRAWS, 1.0
-    segments.fit_segments(*given_, 0, len(wanted), planes, np.empty_like(values))
+    filling.fit_segments(*given_, 0, len(wanted), planes, np.empty_like(values))
     return planes
 
 

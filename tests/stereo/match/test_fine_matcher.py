@@ -13,9 +13,8 @@ from recon.core.errors import MatchingError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
 from recon.stereo.kernels.convolution import UNIT
-from recon.stereo.match import fine, segments, sgm
-from recon.stereo.match.features import Describer, fine_grey, load_network
-from recon.stereo.match.fine import FineSettings
+from recon.stereo.match import fill, fine, sgm
+from recon.stereo.match.fine import Describer, FineSettings, fine_grey, load_network
 from recon.stereo.match.registry import MatchingSettings, make_matcher
 
 HEIGHT, WIDTH = 120, 240
@@ -109,7 +108,7 @@ def test_a_wide_plain_wall_is_the_plane_of_its_rim():
     pair = rendered(truth, texture.astype(np.float32), noise=0.5)
     middle = np.s_[40:160, 110:350]
     right = np.abs(match(pair).values - truth)[middle] < 1
-    with patch.object(segments, "_LEAST_PX", height * width):
+    with patch.object(fill, "_LEAST_PX", height * width):
         without = np.abs(match(pair).values - truth)[middle] < 1
     assert right.mean() > 0.95
     assert right.mean() > without.mean() + 0.1

@@ -11,10 +11,8 @@ from recon.core import errors
 from recon.core.errors import FormatError, MatchingError, MissingDependencyError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
-from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings, describe_network
-from recon.stereo.match.presets import PRESETS
-from recon.stereo.match.self_test import rendered_pair
-from recon.stereo.match.tiles import match_in_tiles
+from recon.stereo.match.network import match_in_tiles, rendered_pair
+from recon.stereo.match.onnx import PRESETS, OnnxMatcher, OnnxSettings, describe_network
 
 onnx = pytest.importorskip("onnx", reason="the package onnx builds the network: pip install onnx")
 pytest.importorskip("onnxruntime", reason="extra onnx: pip install 'recon-stereo[onnx]'")

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
-from recon.stereo.kernels import steps
-from recon.stereo.match.steps import vote_at_steps
+from recon.stereo.kernels import filling
+from recon.stereo.match.fill import vote_at_steps
 
 HEIGHT, WIDTH, EDGE, REACH = 60, 120, 70, 5
 
@@ -96,13 +96,13 @@ def test_kernels_are_their_references(seed, height, width, reach, stride):
     values = rng.choice([1.0, 1.5, 4.0, 9.0, np.nan], (height, width)).astype(np.float32)
     grey = rng.integers(0, 256, values.shape, dtype=np.uint8)
     marked = np.zeros(values.shape, np.uint8)
-    steps.mark_steps(values, reach, 1.0, marked)
+    filling.mark_steps(values, reach, 1.0, marked)
     np.testing.assert_array_equal(marked, mark_steps_reference(values, reach, 1.0))
     alike = np.exp(np.arange(256) / -8.0).astype(np.float32)
-    vote, own = steps.Vote(3 * reach, stride, 1.0, 0.05), np.empty(values.shape, np.float32)
+    vote, own = filling.Vote(3 * reach, stride, 1.0, 0.05), np.empty(values.shape, np.float32)
     middle = height // 2
     for first, end in ((0, middle), (middle, height)):
-        steps.take_votes(values, grey, alike, marked, vote, first, end, own)
+        filling.take_votes(values, grey, alike, marked, vote, first, end, own)
     expected = take_votes_reference(values, grey, alike, marked, vote)
     sure = (
         np.abs(np.abs(own - np.round(own * 2) / 2)) > 1e-5

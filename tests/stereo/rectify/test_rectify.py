@@ -291,7 +291,6 @@ def test_a_good_pair_has_rows_that_correspond_whatever_wrong_matches_say():
     assert found.features > 100
     # A tenth of a pixel: cubic interpolation and one grey level of noise.
     assert abs(found.epipolar_error_px) < 0.1
-    assert 0.0 <= found.row_spread_px < 0.3
     assert found.negative_ratio < 0.02
     assert features.check_inspection(found) == ()
     # Middlebury's doffs: a far point may have a negative disparity in a good pair.

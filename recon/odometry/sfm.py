@@ -1,24 +1,37 @@
-"""COLMAP: features and matches of rectified pairs in its database, and the models they give."""
+"""Structure from motion over all pairs of a source, before the first of them is mapped, by COLMAP.
+
+Features of every image, matches between pairs that may see the same, and a model that grows by one
+pair after another, adjusted as a whole. The rig is held, so lengths are metres. Pairs that share
+nothing are in models of their own.
+
+Ref: Schönberger, Frahm, "Structure-from-motion revisited", CVPR 2016.
+"""
 
 from __future__ import annotations
 
 import math
 import signal
+import tempfile
 import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
 
-from recon.core.errors import require
+from recon.core.errors import RegistrationError, SettingsError, require
 from recon.core.geometry.se3 import apply, invert
+from recon.core.text import counted
 from recon.core.values import RectifiedCamera, RectifiedPair
-from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.core.work import side_by_side
-from recon.odometry.sfm.found import Model
+from recon.core.values.arrays import Float32, Float64, Int64, UInt8
+from recon.core.work import Stopwatch, side_by_side
+from recon.odometry.health import name_frames
+from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult
+from recon.sources.source import StereoSource, check_source
+from recon.stereo.rectify.rectifier import RectificationSettings, Rectifier
 
 _PIXELS: Final = 1_300_000
 """Of the image in which features are found; larger ones are shrunk. They stay accurate to a tenth
@@ -64,7 +77,8 @@ class Colmap:
         self._api.set_random_seed(_SEED)
         self._camera, self._folder, self._threads = camera, folder, threads
         self._database = folder / "colmap.db"
-        self._most_pixels = most_pixels(limit_mb, threads)
+        quarter = math.inf if limit_mb is None else 1e6 * limit_mb / 4  # of the memory, bytes
+        self._most_pixels = min(_PIXELS, quarter / (_PIXEL_BYTES * threads))
         shrunk = camera.width_px * camera.height_px / self._most_pixels
         self._sigma_px = _SIGMA_PX * max(1.0, math.sqrt(shrunk))
 
@@ -108,7 +122,11 @@ class Colmap:
         options.min_model_size = 2
         options.extract_colors = False
         _hold_rig(options, "ba_refine_")
-        self._thresholds(options)
+        options.mapper.init_max_error = _VERIFIED * self._sigma_px
+        options.mapper.abs_pose_max_error = _REGISTERED * self._sigma_px
+        options.mapper.filter_max_reproj_error = _LEFT_OUT * self._sigma_px
+        options.triangulation.merge_max_reproj_error = _LEFT_OUT * self._sigma_px
+        options.triangulation.complete_max_reproj_error = _LEFT_OUT * self._sigma_px
         options.mapper.abs_pose_refine_focal_length = False
         options.mapper.abs_pose_refine_extra_params = False
         models, images = self._folder / "models", self._folder / "images"
@@ -121,14 +139,6 @@ class Colmap:
         for model in by_size:
             self._adjust(model)
         return _apart([_read_model(one, self._camera) for one in by_size])
-
-    def _thresholds(self, options: Any) -> None:
-        mapper, triangulation = options.mapper, options.triangulation
-        mapper.init_max_error = _VERIFIED * self._sigma_px
-        mapper.abs_pose_max_error = _REGISTERED * self._sigma_px
-        mapper.filter_max_reproj_error = _LEFT_OUT * self._sigma_px
-        triangulation.merge_max_reproj_error = _LEFT_OUT * self._sigma_px
-        triangulation.complete_max_reproj_error = _LEFT_OUT * self._sigma_px
 
     def _adjust(self, model: Any) -> None:
         """Adjust a model once more, so that wrong matches that are left count little."""
@@ -211,13 +221,6 @@ def _hold_rig(options: Any, prefix: str) -> None:
         setattr(options, f"{prefix}{held}", False)
 
 
-def most_pixels(limit_mb: float | None, threads: int) -> float:
-    """Return the size of the largest image in which features are found, in pixels."""
-    if limit_mb is None:
-        return _PIXELS
-    return min(_PIXELS, 1e6 * limit_mb / (4 * _PIXEL_BYTES * threads))  # a quarter of the memory
-
-
 def find_features(image: UInt8, most: float) -> tuple[Float32, UInt8]:
     """Find SIFT features of an image (H, W): places (N, 4) as COLMAP has them, RootSIFT (N, 128).
 
@@ -297,3 +300,141 @@ def _apart(models: Sequence[Model]) -> tuple[Model, ...]:
         parts = (model.frames[new], based, model.points[new], model.sigmas[new])
         kept.append(Model(*parts, model.reprojection_px))
     return tuple(kept)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Pairs whose poses beside each other are known."""
+
+    frames: Int64  # (M,), their numbers in the source, ascending
+    T_world_camera: Float64  # (M, 4, 4), of the rectified left camera; the first is the identity
+    points: Int64  # (M,), points of the model that the left image shows
+    # (M, 2), standard deviations of position (metres) and rotation (degrees), given the points
+    sigmas: Float64
+    reprojection_px: float  # mean error of all features
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPoses:
+    """What structure from motion found of the pairs of a source."""
+
+    pairs: int  # number of pairs of the source
+    models: tuple[Model, ...]  # the largest first; no pair is in two of them
+
+    def figures(self) -> dict[str, Any]:
+        return {
+            "pairs": self.pairs,
+            "registered": len(self.models[0].frames),
+            "models": [len(model.frames) for model in self.models],
+            "reprojection_px": self.models[0].reprojection_px,
+        }
+
+    def warnings(self) -> list[str]:
+        """Return what the user should know, the most important first."""
+        largest, *others = self.models
+        missing = self.pairs - len(largest.frames)
+        if not missing:
+            return []
+        apart = "; ".join(
+            f"{counted(len(one.frames), 'pair')} among themselves "
+            f"({name_frames(one.frames.tolist())})"
+            for one in others
+        )
+        what = f"{missing} of {counted(self.pairs, 'pair')} could not be placed beside the others"
+        return [f"{what}, and are not in the map{f'; placed are {apart}' if apart else ''}"]
+
+
+class FoundOdometry:
+    """An odometry whose poses are those that structure from motion found; the largest model counts.
+
+    Pairs that are not in it get the pose of one before, and are not to be trusted.
+
+    Args:
+        found: What was found; None = comes with `restore`.
+    """
+
+    def __init__(self, found: FoundPoses | None = None) -> None:
+        self._found = found
+        self._next = 0
+
+    @property
+    def found(self) -> FoundPoses:
+        if self._found is None:
+            raise RegistrationError("structure from motion has found nothing yet")
+        return self._found
+
+    def register(self, frame: OdometryFrame) -> OdometryResult:
+        model, index = self.found.models[0], self._next
+        self._next += 1
+        at = max(0, int(np.searchsorted(model.frames, index, side="right")) - 1)
+        T_world_camera = model.T_world_camera[at]
+        if model.frames[at] != index:
+            notes = ("structure from motion could not place it",)
+            return OdometryResult(T_world_camera, OdometryHealth(False, skipped=True, notes=notes))
+        points, (sigma_m, sigma_deg) = int(model.points[at]), model.sigmas[at].tolist()
+        health = OdometryHealth(
+            tracks=points, inliers=points, sigma_m=sigma_m, sigma_deg=sigma_deg,
+            reprojection_px=model.reprojection_px,
+        )  # fmt: skip
+        return OdometryResult(T_world_camera, health)
+
+    def state(self) -> dict[str, Any]:
+        models = {str(number): vars(model) for number, model in enumerate(self.found.models)}
+        return {"next": self._next, "pairs": self.found.pairs, "models": models}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        models = tuple(Model(**state["models"][key]) for key in sorted(state["models"], key=int))
+        self._found, self._next = FoundPoses(int(state["pairs"]), models), int(state["next"])
+
+
+def check_sfm(source: StereoSource) -> None:
+    """Refuse what structure from motion cannot work with, and say which package is missing."""
+    check_source(source, stereo=True)
+    load_colmap()
+    if source.live:
+        what = "structure from motion needs all pairs before it begins"
+        raise SettingsError(what, where=source.name, hint="record the drive, then recon map it")
+
+
+@dataclass(frozen=True)
+class SfmOptions:
+    """How the poses of a source are found."""
+
+    rectification: RectificationSettings
+    folder: Path | None = None  # where temporary files may be; None = where the system has them
+    threads: int = 1
+    limit_mb: float | None = None  # memory
+    stopwatch: Stopwatch = field(default_factory=Stopwatch)
+
+
+def find_poses(source: StereoSource, options: SfmOptions) -> FoundPoses:
+    """Find the poses of all pairs of a source, whatever their order.
+
+    Raises:
+        RegistrationError: No two pairs can be placed beside each other.
+        SettingsError: The source is live.
+        MissingDependencyError: The extra ``sfm`` is not installed.
+    """
+    check_sfm(source)
+    stage = options.stopwatch.stage
+    try:
+        with tempfile.TemporaryDirectory(prefix="sfm-", dir=options.folder) as folder:
+            rectifier = Rectifier(source.calibration, options.rectification)
+            work = Colmap(rectifier.camera, Path(folder), options.threads, options.limit_mb)
+            with stage("sfm_features"):
+                work.add_features(map(rectifier.rectify, source.frames()))
+            with stage("sfm_match"):
+                work.match(len(source))
+            with stage("sfm_map"):
+                models = work.map()
+    except (RuntimeError, ValueError, IndexError) as error:  # those of C++
+        what, hint = "structure from motion failed", "try --odometry visual"
+        raise RegistrationError(what, where=source.name, got=error, hint=hint) from error
+    if not models:
+        raise RegistrationError(
+            "structure from motion found no two pairs that see the same",
+            where=source.name,
+            got=counted(len(source), "pair"),
+            hint="take pairs that overlap by half; recon pair makes a cloud of a single one",
+        )
+    return FoundPoses(len(source), models)
