@@ -24,14 +24,14 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float32
 from recon.evaluation.disparity import evaluate_disparity
-from recon.evaluation.map import evaluate_map
-from recon.evaluation.map_comparison import (
+from recon.evaluation.map import (
     LEAST_FRAMES,
     MapComparison,
     ReferenceFrame,
     add_within_reach,
     doubt_axes,
     doubts_of_file,
+    evaluate_map,
     map_of_run,
     occupancy_view,
     place_by_icp,

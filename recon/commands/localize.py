@@ -26,7 +26,7 @@ from recon.map.localize.sequence import LocalizeRun, StartPose, localize_sequenc
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
-from recon.rig.cameras import CameraSource
+from recon.rig.capture import CameraSource
 from recon.run.finished import GRID, STATES, figure_of, refuse_as_target
 from recon.run.run import SUMMARY
 from recon.sources.live import LiveSource

@@ -25,16 +25,19 @@ from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.files import resolved
 from recon.io.trajectory import FRAMES, read_frames
 from recon.sources.calibration import read_rig
-from recon.sources.image_names import find_partners, natural_key, partner_names, split_sides
 from recon.sources.images import (
     ImageFrame,
     ImageSource,
     existing,
+    find_partners,
     image_size,
     is_image,
     list_images,
+    natural_key,
     pair_listed,
     pair_named,
+    partner_names,
+    split_sides,
     stamps_of,
 )
 from recon.sources.settings import SourceSettings

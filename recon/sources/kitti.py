@@ -34,12 +34,12 @@ from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offs
 from recon.io.files import resolved
 from recon.io.trajectory import read_kitti_poses
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
-from recon.sources.image_names import natural_key
 from recon.sources.images import (
     ImageFrame,
     ImageSource,
     image_size,
     list_images,
+    natural_key,
     pair_listed,
     pair_named,
 )

@@ -38,8 +38,14 @@ from recon.io.cameras.ros import NS, read_euroc_camera, read_euroc_truth
 from recon.io.files import resolved
 from recon.io.imu import read_axes, read_imu, read_kalibr_imu
 from recon.sources.calibration import as_rectified, find_calibration, read_rig
-from recon.sources.image_names import find_partners
-from recon.sources.images import ImageSource, image_size, is_image, pair_listed, stamps_of
+from recon.sources.images import (
+    ImageSource,
+    find_partners,
+    image_size,
+    is_image,
+    pair_listed,
+    stamps_of,
+)
 from recon.sources.settings import SourceSettings
 from recon.sources.times import check_seconds, read_stamped_names, read_tum_truth, truth_at
 

@@ -18,7 +18,7 @@ from recon.core.values.arrays import UInt8
 from recon.io.files import resolved
 from recon.io.images.video import VIDEOS, VideoFile, open_video
 from recon.sources.calibration import read_rig
-from recon.sources.image_names import find_partners
+from recon.sources.images import find_partners
 from recon.sources.settings import SourceSettings
 from recon.sources.source import Recording, pair_frames
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from recon.core.geometry import se3
 from recon.core.values.arrays import Float64
-from recon.street.buildings import draw_plan, house, wall_with_holes
 from recon.street.path import R_STREET_LEVEL, CentreLine, lap
+from recon.street.props import draw_plan, house, wall_with_holes
 from recon.street.settings import StreetScene
 from recon.street.shapes import Material, Paint, TriangleSoup, at, boxes, merge, move, quads
 

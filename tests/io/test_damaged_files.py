@@ -11,10 +11,9 @@ import pytest
 from recon.core.errors import CalibrationError, FormatError, ReconError, ShapeError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import FREE, CameraIntrinsics, OccupancyGrid, StereoCalibration
-from recon.io.cameras.calibration import read_calibration
+from recon.io.cameras.calibration import read_calibration, write_recon_calibration
 from recon.io.cameras.kitti import read_kitti_calib
 from recon.io.cameras.opencv_yaml import read_file_storage
-from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.cameras.ros import read_euroc_truth, write_kalibr
 from recon.io.fields import read_toml, read_yaml
 from recon.io.files import read_table, read_text

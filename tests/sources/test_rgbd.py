@@ -15,7 +15,7 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, RectifiedImage, StereoCalibration
 from recon.core.values.camera import depth_from_disparity, depth_sigma
 from recon.evaluation.trajectory import evaluate_trajectory
-from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.cameras.calibration import write_recon_calibration
 from recon.io.images.image import write_image
 from recon.map.drive.sequence import map_sequence
 from recon.odometry.features import find_in_right

@@ -12,17 +12,18 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.errors import FormatError, OutputError, SettingsError
+from recon.core.errors import FormatError, MeshingError, OutputError, SettingsError
 from recon.core.geometry.se3 import T_YUP_FRAME
+from recon.core.lazy import Lazy
+from recon.core.text import counted
 from recon.core.values import Texture, TriangleMesh
-from recon.core.values.arrays import UInt8
+from recon.core.values.arrays import Float32, Int32, UInt8
 from recon.core.values.cloud import Frame
 from recon.io.atomic import atomic_path, write_bytes, write_text
 from recon.io.files import StrPath, reader
 from recon.io.images.image import encode_image, write_image
-from recon.io.models.columns import attributes_in, columns_of, positions_in, table_of
-from recon.io.models.ply_tables import (
-    Table,
+from recon.io.models.columns import Table, attributes_in, columns_of, positions_in, table_of
+from recon.io.models.ply import (
     list_length,
     read_tables,
     write_table_parts,
@@ -65,11 +66,11 @@ def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) ->
     elif suffix == ".obj" and texture is not None:
         _write_textured_obj(Path(path), mesh, texture)
     else:
-        # Importing Open3D takes two seconds; PLY files do not need it.
-        from recon.io.models import open3d_meshes  # noqa: PLC0415
-
-        with atomic_path(path) as temporary:
-            open3d_meshes.write_mesh(temporary, mesh)
+        with atomic_path(path) as temporary, _quiet():
+            surface = to_open3d(mesh)
+            surface.compute_triangle_normals()
+            if not o3d.io.write_triangle_mesh(temporary, surface):
+                raise OutputError("Open3D could not write the mesh", where=path)
 
 
 def _write_textured_obj(path: Path, mesh: TriangleMesh, texture: Texture) -> None:
@@ -126,9 +127,7 @@ def read_mesh(path: StrPath) -> TriangleMesh:
     if suffix == ".ply":
         mesh = _read_ply(path)
     elif Path(path).is_file():
-        from recon.io.models import open3d_meshes  # noqa: PLC0415
-
-        mesh = open3d_meshes.read_mesh(path)
+        mesh = _read_by_open3d(path)
         if suffix == ".glb" and mesh.rgb is not None:
             mesh = replace(mesh, rgb=srgb_from_linear(mesh.rgb))
     else:
@@ -254,3 +253,69 @@ def _described(arrays: list[NDArray[Any]]) -> tuple[list[dict[str, Any]], list[d
 def _chunk(kind: bytes, content: bytes, filler: bytes) -> bytes:
     content += filler * (-len(content) % 4)
     return struct.pack("<I4s", len(content), kind) + content
+
+
+o3d = Lazy("open3d")
+
+
+def to_open3d(shape: Any) -> Any:
+    """Return a mesh or a cloud as Open3D's, with its normals and colours."""
+    is_mesh, geometry = isinstance(shape, TriangleMesh), o3d.geometry
+    made = (
+        _surface(shape.vertices, shape.faces)
+        if is_mesh
+        else geometry.PointCloud(_vectors(shape.xyz))
+    )
+    of = "vertex_" if is_mesh else ""
+    if shape.normals is not None:
+        setattr(made, f"{of}normals", _vectors(shape.normals))
+    if shape.rgb is not None:
+        setattr(made, f"{of}colors", _vectors(shape.rgb / 255))
+    return made
+
+
+def _read_by_open3d(path: StrPath) -> TriangleMesh:
+    with _quiet():
+        mesh = o3d.io.read_triangle_mesh(Path(path))
+    if not mesh.has_triangles():
+        raise FormatError("the file has no triangles that Open3D can read", where=path)
+    normals = np.asarray(mesh.vertex_normals).astype(np.float32)
+    rgb = np.rint(np.asarray(mesh.vertex_colors) * 255).astype(np.uint8)
+    return TriangleMesh(
+        vertices=np.asarray(mesh.vertices).astype(np.float32),
+        faces=np.asarray(mesh.triangles).astype(np.int32),
+        normals=normals if mesh.has_vertex_normals() else None,
+        rgb=rgb if mesh.has_vertex_colors() else None,
+    )
+
+
+def decimate(
+    vertices: NDArray[Any], faces: NDArray[Any], target_faces: int
+) -> tuple[Float32, Int32]:
+    """Collapse edges until about ``target_faces`` are left (Garland & Heckbert, 1997)."""
+    with _quiet():
+        smaller = _surface(vertices, faces).simplify_quadric_decimation(
+            target_faces, boundary_weight=3.0
+        )
+    if not smaller.has_triangles():
+        got = f"target of {counted(target_faces, 'face')}"
+        raise MeshingError("decimation left no face", got=got)
+    vertices, faces = np.asarray(smaller.vertices), np.asarray(smaller.triangles)
+    return vertices.astype(np.float32), faces.astype(np.int32)
+
+
+def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
+    """Return an Open3D mesh of copies; it accepts neither read-only nor float32 arrays."""
+    return o3d.geometry.TriangleMesh(
+        _vectors(vertices),
+        o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32)),
+    )
+
+
+def _vectors(values: NDArray[Any]) -> Any:
+    return o3d.utility.Vector3dVector(np.array(values, dtype=np.float64))
+
+
+def _quiet() -> Any:
+    """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
+    return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)

@@ -26,7 +26,7 @@ from recon.rig.calibrate.detect import (
     grown_size,
     orient_like,
 )
-from recon.sources.image_names import ImagePairs
+from recon.sources.images import ImagePairs
 from recon.sources.settings import SourceSettings
 from recon.sources.video import open_videos, split_views, view_size
 from recon.stereo.rectify.rectifier import to_grey

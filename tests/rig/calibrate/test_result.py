@@ -9,12 +9,11 @@ from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
 from recon.rig.calibrate import result
 from recon.rig.calibrate.board_views import BoardViews
-from recon.rig.calibrate.bootstrap import measure_spread
-from recon.rig.calibrate.stereo import calibrate_stereo
+from recon.rig.calibrate.stereo import calibrate_stereo, measure_spread
 from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
 from recon.rig.settings import CalibratedSettings, CalibrationSettings
 from recon.rig.written import CalibrationForm
-from recon.sources.image_names import ImagePairs
+from recon.sources.images import ImagePairs
 
 SIZE = (640, 480)
 
