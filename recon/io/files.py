@@ -10,6 +10,7 @@ import re
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from functools import wraps
 from itertools import chain
 from os import PathLike
@@ -19,7 +20,7 @@ from typing import Any, Final, ParamSpec, TypeVar, cast
 import numpy as np
 
 from recon.core.errors import FormatError, ReconError
-from recon.core.text import parse_numbers
+from recon.core.text import parse_number, parse_numbers
 from recon.core.values.arrays import Float64
 
 StrPath = str | PathLike[str]
@@ -167,6 +168,18 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
     if not rows:
         raise FormatError("file contains no numbers", where=path)
     return np.array(rows, dtype=np.float64), lines
+
+
+def seconds_of_date(text: str, where: StrPath) -> float:
+    """Return seconds since 1970 of a date and time in UTC, with more digits than Python reads."""
+    whole, _, part = text.strip().replace("T", " ").replace("/", "-").partition(".")
+    try:
+        whole.encode("ascii")
+        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+        return moment.timestamp() + parse_number(f"0.{part or 0}")
+    except ValueError as error:
+        what, expected = "not a time", "2011-09-26 13:02:25.964389445"
+        raise FormatError(what, where=where, got=text[:40], expected=expected) from error
 
 
 def parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[float]:

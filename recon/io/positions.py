@@ -17,7 +17,14 @@ import numpy as np
 from recon.core.errors import EvaluationError, FormatError, require
 from recon.core.text import counted, parse_numbers
 from recon.core.values.arrays import Float64
-from recon.io.files import StrPath, read_lines, read_table, read_text, reader
+from recon.io.files import (
+    StrPath,
+    read_lines,
+    read_table,
+    read_text,
+    reader,
+    seconds_of_date,
+)
 from recon.io.models.las import check_crs
 from recon.io.trajectory import check_positions
 
@@ -117,8 +124,7 @@ def read_positions(path: StrPath) -> Positions:
 def in_order(found: Positions, path: StrPath) -> Positions:
     """Return positions in the order of time, without those that say that there is none.
 
-    Raises:
-        FormatError: There is none, or one is no place on earth.
+    One that is no place on earth is refused, and a file without any.
     """
     good = np.isfinite(found.places).all(axis=1) & np.isfinite(found.times_s)
     if found.degrees:
@@ -172,17 +178,13 @@ def _read_named(path: Path, columns: dict[str, int]) -> Positions:
         if line.strip() and not line.lstrip().startswith("#")
     ]
     used = [columns[name] for name in ("time", "lat", "lon", "height", "sigma")]
-    table = np.array([_numbers(row, [*filter(_is_there, used)], path) for row in rows])
+    table = np.array([_numbers(row, [n for n in used if n >= 0], path) for row in rows])
     if not len(table):
         raise FormatError("the file has no position", where=path)
     sigma_m = np.full((len(table), 3), np.nan)
     if table.shape[1] == 5:
         sigma_m[:] = table[:, 4:]
     return Positions(table[:, 0], table[:, 1:4], sigma_m, degrees=True)
-
-
-def _is_there(column: int) -> bool:
-    return column >= 0
 
 
 def _numbers(words: Sequence[str], columns: Sequence[int], path: Path) -> list[float]:
@@ -194,7 +196,6 @@ def _numbers(words: Sequence[str], columns: Sequence[int], path: Path) -> list[f
 
 
 def _read_oxts(folder: Path) -> Positions:
-    """Read a folder ``oxts`` of KITTI's raw data, or one that has it."""
     folder = folder / "oxts" if (folder / "oxts").is_dir() else folder
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
@@ -204,26 +205,14 @@ def _read_oxts(folder: Path) -> Positions:
     if len(lines) != len(files):
         got, expected = counted(len(lines), "time"), counted(len(files), "time")
         raise FormatError("wrong number of times", where=folder, got=got, expected=expected)
-    times_s = [_seconds(line, folder / "timestamps.txt") for line in lines]
+    times_s = [seconds_of_date(line, folder / "timestamps.txt") for line in lines]
     # Latitude, longitude, altitude; accuracy of the position (1 sigma) is number 23.
     rows = np.array([_numbers(read_text(one).split(), (0, 1, 2, 23), one) for one in files])
     sigma_m = np.repeat(rows[:, 3:], 3, axis=1)
     return Positions(np.array(times_s), rows[:, :3], sigma_m, degrees=True, heights=_ELLIPSOID)
 
 
-def _seconds(text: str, path: Path) -> float:
-    """Return seconds since 1970 of a date and time in UTC, with more digits than Python reads."""
-    whole, _, part = text.strip().replace("T", " ").replace("/", "-").partition(".")
-    try:
-        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
-        return moment.timestamp() + float(f"0.{part or 0}")
-    except ValueError as error:
-        what, expected = "not a time", "2011-09-26 13:02:25.964"
-        raise FormatError(what, where=path, got=text[:40], expected=expected) from error
-
-
 def _read_rtklib(path: Path) -> Positions:
-    """Read a solution of RTKLIB: its last line of ``%`` names the columns."""
     lines = read_lines(path)
     heads = [line.lstrip("% ") for line in lines if line.startswith("%")]
     names = heads[-1].split() if heads else []
@@ -254,7 +243,7 @@ def _read_rtklib(path: Path) -> Positions:
 def _on_ellipsoid(table: Float64) -> tuple[Float64, Float64]:
     """Return latitude, longitude and height, and standard deviations east, north and up (N, 3).
 
-    ``table`` (N, 9) has coordinates from the centre of the earth, their standard deviations, and
+    ``table`` (N, 9) is RTKLIB's: coordinates from the centre of the earth, their deviations, and
     signed roots of the covariances of x and y, y and z, z and x.
     """
     pyproj = require("pyproj", extra="survey")
@@ -273,16 +262,13 @@ def _on_ellipsoid(table: Float64) -> tuple[Float64, Float64]:
 
 def _rtklib_time(words: Sequence[str], path: Path, *, gps: bool) -> float:
     if "/" in words[0]:
-        seconds = _seconds(" ".join(words), path)
+        seconds = seconds_of_date(" ".join(words), path)
     else:  # week and seconds
         week, of_week = _numbers(words, (0, 1), path)
         seconds = (_GPS_EPOCH + timedelta(weeks=week, seconds=of_week)).timestamp()
-    return seconds - _leap_seconds(seconds) if gps else seconds
-
-
-def _leap_seconds(time_s: float) -> int:
-    moment = datetime.fromtimestamp(time_s, timezone.utc)
-    return next((n for year, month, n in _LEAPS if (moment.year, moment.month) >= (year, month)), 0)
+    at = datetime.fromtimestamp(seconds, timezone.utc)
+    leaps = next((n for year, month, n in _LEAPS if (at.year, at.month) >= (year, month)), 0)
+    return seconds - leaps if gps else seconds
 
 
 def _read_nmea(path: Path) -> Positions:
@@ -299,7 +285,9 @@ def _read_nmea(path: Path) -> Positions:
             north, east, up = _numbers(words, (5, 6, 7), path)
             deviations[words[0]] = [east, north, up]
         elif kind == "GGA" and len(words) > 8 and words[5] not in ("", "0"):
-            time_s = _time_of_day(words[0], path)
+            clock = words[0][:2], words[0][2:4], words[0][4:]
+            hours, minutes, seconds = _numbers(clock, (0, 1, 2), path)
+            time_s = 3600.0 * hours + 60.0 * minutes + seconds
             # Midnight may come before the new date.
             time_s += day_s + (86400.0 if day_s + time_s < before_s - 43200.0 else 0.0)
             before_s = time_s
@@ -324,24 +312,15 @@ def _sentences(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield kind and fields of the sentences whose checksum is right."""
     for line in read_text(path).splitlines():
         content, star, checksum = line.strip().lstrip("$").partition("*")
-        if not star or not _matches(content, checksum):
+        if not star or f"{reduce(xor, content.encode(), 0):02X}" != checksum.strip().upper():
             continue
         kind, *words = content.split(",")
         yield kind[2:], words
 
 
-def _matches(content: str, checksum: str) -> bool:
-    return f"{reduce(xor, content.encode(), 0):02X}" == checksum.strip().upper()
-
-
 def _day(year: str, month: str, day: str, path: Path) -> float:
     century = 0 if len(year) == 4 else 1900 if int(year) >= 70 else 2000
-    return _seconds(f"{century + int(year)}-{month}-{day} 00:00:00", path)
-
-
-def _time_of_day(text: str, path: Path) -> float:
-    hours, minutes, seconds = _numbers([text[:2], text[2:4], text[4:]], (0, 1, 2), path)
-    return 3600.0 * hours + 60.0 * minutes + seconds
+    return seconds_of_date(f"{century + int(year)}-{month}-{day} 00:00:00", path)
 
 
 def _degrees(text: str, side: str, path: Path) -> float:
@@ -397,7 +376,9 @@ def read_control(path: StrPath, crs: str | None = None) -> ControlPoints:
     """
     lines = [line.split() for line in read_lines(path)]
     rows = [(n, words) for n, words in enumerate(lines, 1) if words and words[0][0] != "#"]
-    system = _system_of(" ".join(rows[0][1]))
+    system = " ".join(rows[0][1])
+    if utm := _UTM.match(system):
+        system = f"EPSG:{(32600 if utm[2] in 'Nn' else 32700) + int(utm[1])}"
     named: dict[str, list[_Row]] = {}
     for number, words in rows[1:]:
         row = _row(words, f"{path}:{number}")
@@ -441,11 +422,6 @@ def _row(words: list[str], where: str) -> _Row:
     if not (numbers and np.isfinite(numbers).all()):
         raise FormatError("not five numbers", where=where, got=" ".join(words[:5]))
     return _Row(numbers, words[5], name, bool(more))
-
-
-def _system_of(text: str) -> str:
-    utm = _UTM.match(text)
-    return f"EPSG:{(32600 if utm[2] in 'Nn' else 32700) + int(utm[1])}" if utm else text
 
 
 def _in_metres(places: Float64, system: str, crs: str | None, path: StrPath) -> tuple[Float64, str]:

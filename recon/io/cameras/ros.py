@@ -178,25 +178,21 @@ def write_camera_info(
     for side, camera, rotation, shift in zip(_SIDES, cameras, rotations, shifts, strict=True):
         P = np.hstack([rectified.matrix, [[shift], [0.0], [0.0]]])
         P[0, 2] = rectified.cx_right_px if side == "right" else rectified.cx_px
-        texts.append(_camera_info(side, camera, rotation, P))
+        name, coefficients = _name_lens(ROS_MODELS, camera, "ROS CameraInfo")
+        content = {
+            "image_width": camera.width_px,
+            "image_height": camera.height_px,
+            "camera_name": side,
+            "camera_matrix": _matrix(camera.matrix),
+            "distortion_model": name,
+            "distortion_coefficients": _matrix(coefficients.reshape(1, -1)),
+            "rectification_matrix": _matrix(rotation),
+            "projection_matrix": _matrix(P),
+        }
+        texts.append(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
     for target, text in zip(paths, texts, strict=True):
         write_text(target, text)
     return paths
-
-
-def _camera_info(side: str, camera: CameraIntrinsics, rotation: Float64, P: Float64) -> str:
-    name, coefficients = _name_lens(ROS_MODELS, camera, "ROS CameraInfo")
-    content = {
-        "image_width": camera.width_px,
-        "image_height": camera.height_px,
-        "camera_name": side,
-        "camera_matrix": _matrix(camera.matrix),
-        "distortion_model": name,
-        "distortion_coefficients": _matrix(coefficients.reshape(1, -1)),
-        "rectification_matrix": _matrix(rotation),
-        "projection_matrix": _matrix(P),
-    }
-    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
 
 
 def _matrix(values: NDArray[Any]) -> dict[str, Any]:

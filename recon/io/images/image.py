@@ -111,7 +111,7 @@ def _decode(content: bytes, max_megapixels: float) -> NDArray[Any]:
         raise FormatError(what, got=f"{size[0]}x{size[1]}", expected=expected, hint=hint)
     check_image_bytes(content)
     try:
-        with silent_opencv() if is_tiff(content) else nullcontext():
+        with silent_opencv() if content.startswith(_TIFF_STARTS) else nullcontext():
             image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise FormatError("image cannot be decoded", got=error.err) from error
@@ -136,7 +136,21 @@ def read_grey_levels(path: StrPath) -> NDArray[Any]:
 def write_image(path: StrPath, image: NDArray[Any]) -> None:
     """Write uint8 or uint16, (H, W) or RGB (H, W, 3), atomically, in the format of the suffix."""
     suffix = Path(path).suffix.lower()
-    _check_writable(path, suffix, image)
+    got = f"{image.dtype.name} {image.shape}"
+    grey, colour = image.ndim == 2, image.ndim == 3 and image.shape[2] == 3
+    if image.dtype not in (np.uint8, np.uint16) or not (grey or colour) or image.size == 0:
+        expected = "uint8 or uint16 (H, W) or (H, W, 3)"
+        raise ShapeError("array is not an image", got=got, expected=expected)
+    if suffix not in _WRITABLE:
+        what, expected = "unknown image format", ", ".join(sorted(_WRITABLE))
+        raise OutputError(what, where=path, got=suffix or "no suffix", expected=expected)
+    if (
+        (suffix in _GREY_ONLY and colour)
+        or (suffix in _COLOUR_ONLY and grey)
+        or (suffix in _EIGHT_BIT_ONLY and image.dtype != np.uint8)
+    ):
+        what = f"a {suffix} file cannot hold this image"
+        raise OutputError(what, where=path, got=got, hint="write .png")
     write_bytes(path, encode_image(image, suffix, path))
 
 
@@ -168,24 +182,6 @@ def silent_opencv() -> Iterator[None]:
 def swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:
     """Convert between RGB and OpenCV's BGR, in either direction."""
     return np.ascontiguousarray(image[:, :, ::-1])
-
-
-def _check_writable(path: StrPath, suffix: str, image: NDArray[Any]) -> None:
-    got = f"{image.dtype.name} {image.shape}"
-    grey, colour = image.ndim == 2, image.ndim == 3 and image.shape[2] == 3
-    if image.dtype not in (np.uint8, np.uint16) or not (grey or colour) or image.size == 0:
-        expected = "uint8 or uint16 (H, W) or (H, W, 3)"
-        raise ShapeError("array is not an image", got=got, expected=expected)
-    if suffix not in _WRITABLE:
-        what, expected = "unknown image format", ", ".join(sorted(_WRITABLE))
-        raise OutputError(what, where=path, got=suffix or "no suffix", expected=expected)
-    if (
-        (suffix in _GREY_ONLY and colour)
-        or (suffix in _COLOUR_ONLY and grey)
-        or (suffix in _EIGHT_BIT_ONLY and image.dtype != np.uint8)
-    ):
-        what = f"a {suffix} file cannot hold this image"
-        raise OutputError(what, where=path, got=got, hint="write .png")
 
 
 def pixels_of_ros_image(
@@ -251,13 +247,8 @@ def check_image_bytes(content: bytes) -> None:
         _check_pnm(content)
     elif content.startswith(b"BM"):
         _check_bmp(content)
-    elif not is_tiff(content):
+    elif not content.startswith(_TIFF_STARTS):
         raise FormatError("not an image", expected="PNG, JPEG, PGM, PPM, BMP or TIFF")
-
-
-def is_tiff(content: bytes) -> bool:
-    """Return whether the content starts like a TIFF."""
-    return content.startswith(_TIFF_STARTS)
 
 
 def _truncated(kind: str, got: str) -> FormatError:
@@ -266,7 +257,7 @@ def _truncated(kind: str, got: str) -> FormatError:
 
 
 def _check_png(content: bytes) -> None:
-    """Walk the chunks up to IEND; each must be complete and match its checksum."""
+    # Each chunk up to IEND must be complete and match its checksum.
     at, name = len(_PNG_START), b""
     while name != b"IEND":
         if at + 12 > len(content):
@@ -283,7 +274,7 @@ def _check_png(content: bytes) -> None:
 
 
 def _check_jpeg(content: bytes) -> None:
-    """Look for the end marker after the start of scan; an embedded thumbnail has its own."""
+    # The end marker comes after the start of scan; an embedded thumbnail has its own.
     at = 2
     while content[at : at + 2] != b"\xff\xda":
         if at + 4 > len(content) or content[at] != 0xFF:
@@ -309,7 +300,7 @@ def _check_pnm(content: bytes) -> None:
 
 
 def _check_bmp(content: bytes) -> None:
-    """Compute the size from rows padded to four bytes, as a header may declare a size of 0."""
+    # Rows are padded to four bytes; a header may declare a size of 0.
     if len(content) < _BMP_HEADER.size:
         size = counted(len(content), "byte")
         raise _truncated("BMP", f"the file ends after {size}, in its header")
@@ -322,21 +313,16 @@ def _check_bmp(content: bytes) -> None:
         raise _truncated("BMP", f"{len(content)} of {counted(needed, 'byte')}")
 
 
-@contextmanager
-def _silent_pillow() -> Iterator[None]:
-    """Leave unsaid what Pillow warns of in damaged headers: their check says it in a line."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
 def stated_size(content: bytes) -> tuple[int, int] | None:
     """Return the width and height that a header states; None = a damaged or unknown one."""
     reader = next((kind for start, kind in _READERS.items() if content.startswith(start)), None)
     try:
         with _silent_pillow():
-            if is_tiff(content):
-                width, height = _tiff_size(content)
+            if content.startswith(_TIFF_STARTS):  # Pillow's reader knows fewer kinds of pixels
+                directory, stream = ImageFileDirectory_v2(content[:8]), BytesIO(content)
+                stream.seek(directory.next)
+                directory.load(stream)
+                width, height = directory[_TIFF_WIDTH], directory[_TIFF_HEIGHT]
             elif reader is not None:  # `PIL.Image.open` has a limit of its own
                 width, height = reader(BytesIO(content)).size
             else:
@@ -346,12 +332,12 @@ def stated_size(content: bytes) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _tiff_size(content: bytes) -> tuple[int, int]:
-    """Read the first directory alone: Pillow's reader knows fewer kinds of pixels than ours."""
-    directory, stream = ImageFileDirectory_v2(content[:8]), BytesIO(content)
-    stream.seek(directory.next)
-    directory.load(stream)
-    return directory[_TIFF_WIDTH], directory[_TIFF_HEIGHT]
+@contextmanager
+def _silent_pillow() -> Iterator[None]:
+    """Leave unsaid what Pillow warns of in damaged headers: their check says it in a line."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 @dataclass(frozen=True)

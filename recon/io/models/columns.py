@@ -35,16 +35,11 @@ def columns_of(points: PointCloud | TriangleMesh, of: Format) -> Columns:
     for each in ATTRIBUTES:
         values, names = getattr(points, each.name, None), getattr(each, of)
         if values is not None and names:
-            found |= zip(names, _split(values, len(names)), strict=True)
+            if values.ndim > len(names):  # three bytes in one column are bits of a float
+                red, green, blue = values.T.astype("<u4")
+                values = (red << 16 | green << 8 | blue).view("<f4")
+            found |= zip(names, values.reshape(len(values), len(names)).T, strict=True)
     return found
-
-
-def _split(values: NDArray[Any], columns: int) -> NDArray[Any]:
-    """Return values (N, …) as so many columns; three bytes in one are bits of a float."""
-    if values.ndim > columns:
-        red, green, blue = values.T.astype("<u4")
-        values = (red << 16 | green << 8 | blue).view("<f4")
-    return np.asarray(values.reshape(len(values), columns).T)
 
 
 def table_of(xyz: NDArray[Any], columns: Columns) -> Table:
@@ -75,7 +70,11 @@ def attributes_in(table: Table, *names: str) -> dict[str, Any]:
         for columns in (each.ply, (each.name,)):
             values = _stacked(table, columns) if each.name in names else None
             if values is not None and each.name not in found and _within(each, values):
-                found[each.name] = _as_own(each, values)
+                if each.width > 1 and each.dtype is np.uint8 and values.dtype.kind == "f":
+                    # Colours as floats are fractions.
+                    values = np.clip(np.nan_to_num(values.astype(np.float32)), 0, 1)
+                    values = np.rint(values * 255)
+                found[each.name] = values.astype(each.dtype).reshape(each.shape(len(values)))
     return found
 
 
@@ -90,13 +89,6 @@ def _within(each: Attribute, values: NDArray[Any]) -> bool:
         return len(values.T) == each.width
     low, high = each.bounds
     return bool(np.all((values >= low) & (values <= high)))
-
-
-def _as_own(each: Attribute, values: NDArray[Any]) -> NDArray[Any]:
-    """Return values (N, width) in the dtype of an attribute; colours that are floats are shares."""
-    if each.width > 1 and each.dtype is np.uint8 and values.dtype.kind == "f":
-        values = np.rint(np.clip(np.nan_to_num(values.astype(np.float32)), 0, 1) * 255)
-    return values.astype(each.dtype).reshape(each.shape(len(values)))
 
 
 def with_first(clouds: Iterable[PointCloud]) -> tuple[PointCloud, Iterator[PointCloud]]:
@@ -134,8 +126,7 @@ def write_row_stream(
 def write_pcd(path: StrPath, clouds: Iterable[PointCloud]) -> int:
     """Write clouds with the same fields into one binary PCD file, atomically; returns the points.
 
-    Positions, normals, confidence and ``sigma`` (of the depth, metres) are float; a colour is the
-    float whose bits are 0x00RRGGBB, as PCL wants it.
+    Values are float; a colour is the float whose bits are 0x00RRGGBB, as PCL wants it.
 
     Ref: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, version 0.7.
     """
@@ -167,7 +158,7 @@ def write_npz(path: StrPath, parts: Iterable[Arrays], whole: Arrays) -> int:
     """Write arrays into one archive, atomically; returns the rows of the parts.
 
     Arrays of the same name in all ``parts`` (n, ...) become one, in a file beside until all have
-    arrived, so that memory holds one part. Names that the first part lacks are not written.
+    arrived, so that memory holds one part; their names are those of the first.
     """
     rows, shapes = 0, {name: (array.dtype, array.shape) for name, array in whole.items()}
     with ExitStack() as stack:

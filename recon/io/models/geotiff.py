@@ -66,11 +66,8 @@ def write_geotiff(
 ) -> Iterator[RasterFile]:
     """Open a GeoTIFF to be written: float32 with NaN where nothing is known, or colours with alpha.
 
-    Only what is written takes room, and memory is bounded. The file appears when all is done.
-
-    Raises:
-        OutputError: The raster is too large.
-        MissingDependencyError: The extra is not installed.
+    Only what is written takes room; the file appears when all is done. A raster that is too large
+    is an `OutputError`.
 
     Ref: OGC 19-008r4, "OGC GeoTIFF Standard", 2019.
     """

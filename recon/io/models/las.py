@@ -38,12 +38,11 @@ def write_las(
     step_m: float = _STEP_M,
     ground: AreGround | None = None,
 ) -> int:
-    """Write clouds into one LAS 1.4 file, atomically; compressed if it ends in ``.laz``.
+    """Write clouds into one LAS 1.4 file, atomically, compressed in ``.laz``; returns their points.
 
-    Positions are rounded to multiples of ``step_m``; colours and, as extra dimensions, what else
-    `ATTRIBUTES` say are written where the clouds have them, all the same. ``T_to_from``
-    (4, 4) leads to the coordinates of the file, in the system ``crs``. Points that ``ground`` says
-    are ground have class 2, all others 1, unclassified. The number of points is returned.
+    Positions are rounded to ``step_m``; colours and, as extra dimensions, what else `ATTRIBUTES`
+    say are those of the first cloud. ``T_to_from`` (4, 4) leads to the coordinates of the file, in
+    the system ``crs``. Points that ``ground`` says are ground have class 2, others 1, unclassified.
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
@@ -74,7 +73,7 @@ def packing(path: StrPath) -> Iterator[Path]:
 def las_header(
     laspy: Any, first: PointCloud, T_to_from: Float64, crs: str | None, step_m: float
 ) -> Any:
-    """Return the header of a file as `write_las` describes it, without points."""
+    """Return the header of a file as `write_las` describes it."""
     header = laspy.LasHeader(point_format=COLOURED, version="1.4")
     header.generating_software = "recon"
     header.global_encoding.wkt = True  # as the format of its points needs, even without a system
@@ -179,9 +178,9 @@ def write_copc(
     step_m: float,
     ground: AreGround | None = None,
 ) -> int:
-    """Write clouds into one COPC file, atomically, as `write_las` does; returns their points.
+    """Write clouds into one COPC file as `write_las` does, with all points in memory.
 
-    All points are in memory at once.
+    Ref: https://copc.io, version 1.0.
     """
     laspy, lazrs = require("laspy", extra=_EXTRA), require("lazrs", extra=_EXTRA)
     first, clouds = with_first(clouds)
@@ -250,10 +249,9 @@ def write_e57(
 ) -> int:
     """Write clouds into one E57 file, atomically, each as a scan; returns the number of points.
 
-    Positions are doubles from an offset of whole metres, which is the pose of each scan, so that
-    programs that round to single precision keep millimetres; with colours where the clouds have
-    them. ``T_to_from`` (4, 4) leads to the coordinates of the file, in the system ``crs``, whose
-    WKT is in the header.
+    Positions are doubles from an offset of whole metres, the pose of each scan, so that programs
+    that round to single precision keep millimetres. ``T_to_from`` (4, 4) and ``crs`` are as in
+    `write_las`.
 
     Ref: ASTM E2807, "Standard specification for 3D imaging data exchange".
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +23,7 @@ from recon.io.files import StrPath, reader
 from recon.io.images.image import encode_image, write_image
 from recon.io.models.columns import Table, attributes_in, columns_of, positions_in, table_of
 from recon.io.models.ply import (
-    list_length,
+    LIST_LENGTH,
     read_tables,
     write_table_parts,
     write_tables,
@@ -43,10 +42,9 @@ _UNLIT: Final = "KHR_materials_unlit"  # colours of images already include the l
 def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:
     """Write a mesh atomically, as .ply, .obj, .stl or .glb by the suffix of the file.
 
-    PLY is binary with float vertices. PLY, OBJ and GLB keep normals, colours and texture; STL has
-    none. The image of a texture is written beside a PLY or OBJ, which has its material in a third
-    file. GLB is glTF 2.0 in one file, which viewers show upright if the ``frame`` of the axes is
-    known.
+    PLY (binary, float), OBJ and GLB keep normals, colours and texture. The image of a texture is
+    written beside a PLY or OBJ, with a material beside OBJ; GLB has it inside, and is shown upright
+    if the ``frame`` of the axes is known.
 
     Raises:
         OutputError: The suffix is unknown, the mesh has no face, or the file cannot be written.
@@ -127,9 +125,25 @@ def read_mesh(path: StrPath) -> TriangleMesh:
     if suffix == ".ply":
         mesh = _read_ply(path)
     elif Path(path).is_file():
-        mesh = _read_by_open3d(path)
-        if suffix == ".glb" and mesh.rgb is not None:
-            mesh = replace(mesh, rgb=srgb_from_linear(mesh.rgb))
+        with _quiet():
+            found = o3d.io.read_triangle_mesh(Path(path))
+        if not found.has_triangles():
+            raise FormatError("the file has no triangles that Open3D can read", where=path)
+        normals = np.asarray(found.vertex_normals).astype(np.float32)
+        shades = np.asarray(found.vertex_colors)
+        rgb = np.rint(shades * 255).astype(np.uint8)
+        if suffix == ".glb":
+            # Open3D takes the linear colours of glTF as they are: IEC 61966-2-1.
+            shades = rgb / 255
+            curve = 1.055 * shades ** (1 / 2.4) - 0.055
+            curve = np.where(shades <= 0.0031308, 12.92 * shades, curve)
+            rgb = np.rint(curve * 255).astype(np.uint8)
+        mesh = TriangleMesh(
+            vertices=np.asarray(found.vertices).astype(np.float32),
+            faces=np.asarray(found.triangles).astype(np.int32),
+            normals=normals if found.has_vertex_normals() else None,
+            rgb=rgb if found.has_vertex_colors() else None,
+        )
     else:
         raise FormatError("no such file")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
@@ -146,8 +160,8 @@ def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
     if mesh.texture is not None:
         columns |= {"s": mesh.texture.uv[:, 0], "t": 1 - mesh.texture.uv[:, 1]}
     name = _INDICES[0]
-    faces = np.zeros(len(mesh.faces), [(list_length(name), "u1"), (name, "<i4", (3,))])
-    faces[list_length(name)] = 3
+    faces = np.zeros(len(mesh.faces), [(name + LIST_LENGTH, "u1"), (name, "<i4", (3,))])
+    faces[name + LIST_LENGTH] = 3
     faces[name] = mesh.faces + np.int32(start)
     return {"vertex": table_of(mesh.vertices, columns), "face": faces}
 
@@ -220,13 +234,6 @@ def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> 
     write_bytes(path, struct.pack("<4sII", b"glTF", 2, length) + head + body)
 
 
-def srgb_from_linear(rgb: UInt8) -> UInt8:
-    """Convert linear colours back to sRGB, for readers that ignore the colour space."""
-    share = rgb / 255
-    curve = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(curve * 255), dtype=np.uint8)
-
-
 def _linear(rgb: UInt8) -> NDArray[np.uint16]:
     """Return uint16 (V, 4): linear red, green, blue and full opacity (IEC 61966-2-1)."""
     share = rgb / 255
@@ -261,32 +268,15 @@ o3d = Lazy("open3d")
 def to_open3d(shape: Any) -> Any:
     """Return a mesh or a cloud as Open3D's, with its normals and colours."""
     is_mesh, geometry = isinstance(shape, TriangleMesh), o3d.geometry
-    made = (
-        _surface(shape.vertices, shape.faces)
-        if is_mesh
-        else geometry.PointCloud(_vectors(shape.xyz))
-    )
-    of = "vertex_" if is_mesh else ""
+    if is_mesh:
+        made, of = _surface(shape.vertices, shape.faces), "vertex_"
+    else:
+        made, of = geometry.PointCloud(_vectors(shape.xyz)), ""
     if shape.normals is not None:
         setattr(made, f"{of}normals", _vectors(shape.normals))
     if shape.rgb is not None:
         setattr(made, f"{of}colors", _vectors(shape.rgb / 255))
     return made
-
-
-def _read_by_open3d(path: StrPath) -> TriangleMesh:
-    with _quiet():
-        mesh = o3d.io.read_triangle_mesh(Path(path))
-    if not mesh.has_triangles():
-        raise FormatError("the file has no triangles that Open3D can read", where=path)
-    normals = np.asarray(mesh.vertex_normals).astype(np.float32)
-    rgb = np.rint(np.asarray(mesh.vertex_colors) * 255).astype(np.uint8)
-    return TriangleMesh(
-        vertices=np.asarray(mesh.vertices).astype(np.float32),
-        faces=np.asarray(mesh.triangles).astype(np.int32),
-        normals=normals if mesh.has_vertex_normals() else None,
-        rgb=rgb if mesh.has_vertex_colors() else None,
-    )
 
 
 def decimate(

@@ -39,9 +39,9 @@ def write_mlp(
     frame: Frame | None = None,
     photos: Sequence[Photo] = (),
 ) -> None:
-    """Write a MeshLab project of layers (label and file, which must exist), atomically.
+    """Write a MeshLab project of layers (label and existing file), atomically.
 
-    Paths are relative to it. MeshLab opens it with y up and looks along -z, so layers are turned if
+    Paths are relative to it. MeshLab opens it with y up and looks along -z: layers are turned if
     their frame is known.
     """
     T = _IDENTITY if frame is None else T_YUP_FRAME[frame]

@@ -1,10 +1,8 @@
-"""Nav2 (ROS) maps: a PGM image and a YAML file that describes it.
+"""Nav2 (ROS) maps: an image and a YAML file that describes it.
 
-Ref: https://docs.nav2.org/configuration/packages/configuring-map-server.html (mode ``trinary``):
-the occupancy of a pixel is ``(255 - value) / 255``; above ``occupied_thresh`` the cell is
-occupied, below ``free_thresh`` free, else unknown. The first row of the image has the largest y.
-In mode ``scale``, pixels that are not opaque are unknown, and those between the thresholds have
-costs from 0 to 100 in proportion.
+Ref: https://docs.nav2.org/configuration/packages/configuring-map-server.html (mode ``trinary``: the
+occupancy of a pixel is ``(255 - value) / 255``; the first row has the largest y; mode ``scale``:
+pixels that are not opaque are unknown, others have costs from 0 to 100 between the thresholds).
 """
 
 from __future__ import annotations
@@ -72,13 +70,14 @@ def _describe(image: Path, mode: str, grid: OccupancyGrid, thresholds: tuple[flo
     # Size and turn of a pixel, and the centre of the first one: gdal.org, raster/wld.html.
     side_m, (x_m, y_m) = grid.resolution_m, grid.origin_m
     world = (side_m, 0, 0, -side_m, x_m + side_m / 2, y_m + (len(grid.cells) - 0.5) * side_m)
-    text = "".join(f"{_shortest(number)}\n" for number in world)
+    # Without the rounding of a product: -64.6, where -646 · 0.1 is just below.
+    text = "".join(f"{number:.12g}\n" for number in world)
     write_text(image.with_suffix(".wld"), text)
     described = {
         "image": image.name,
         "mode": mode,
-        "resolution": float(_shortest(grid.resolution_m)),
-        "origin": [*(float(_shortest(place)) for place in grid.origin_m), 0.0],
+        "resolution": float(f"{side_m:.12g}"),
+        "origin": [float(f"{x_m:.12g}"), float(f"{y_m:.12g}"), 0.0],
         "negate": 0,
         "occupied_thresh": thresholds[0],
         "free_thresh": thresholds[1],
@@ -103,11 +102,6 @@ def read_grid(path: StrPath) -> OccupancyGrid:
     return OccupancyGrid(
         np.ascontiguousarray(cells[::-1]), float(fields["resolution"]), (float(x), float(y))
     )
-
-
-def _shortest(number: float) -> str:
-    """Return a number without the rounding of a product: -64.6, where -646 · 0.1 is just below."""
-    return f"{number:.12g}"
 
 
 def _fields(path: Path) -> dict[str, Any]:

@@ -5,7 +5,7 @@ Ref: G. Turk, "The PLY polygon file format", 1994.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import SEEK_END
 from pathlib import Path
@@ -45,9 +45,8 @@ def write_ply(
 ) -> None:
     """Write a cloud atomically, binary little endian, or text with the same values if ``ascii``.
 
-    Positions and normals are float, colours uchar; ``quality``, float32 (N,), is the confidence
-    unless it is given; what else the cloud has is written as `ATTRIBUTES` say.
-    The frame is a comment. A file that cannot be written is an `OutputError`.
+    Positions and normals are float, colours uchar; ``quality``, float32 (N,), replaces the
+    confidence; the frame is a comment. A file that cannot be written is an `OutputError`.
     """
     rated = cloud if quality is None else replace(cloud, confidence=quality)
     table = table_of(cloud.xyz, columns_of(rated, "ply"))
@@ -56,7 +55,11 @@ def write_ply(
 
 def write_ply_tiles(path: StrPath, clouds: Iterable[PointCloud], *, frame: Frame) -> int:
     """Write clouds of that frame with the same fields, one at a time; returns their points."""
-    return write_table_stream(path, "vertex", tables_of(clouds, "ply"), [_FRAME + frame])
+
+    def header(rows: int, filler: str, dtype: np.dtype[Any]) -> bytes:
+        return _header([("vertex", rows, dtype)], [_FRAME + frame, filler])
+
+    return write_row_stream(path, tables_of(clouds, "ply"), header)
 
 
 @reader
@@ -110,6 +113,7 @@ _TYPES: Final[dict[str, str]] = {
 _NAMES: Final = {code: name for name, code in list(_TYPES.items())[:8]}
 _ORDERS: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 _BINARY: Final = "binary_little_endian"
+LIST_LENGTH: Final = " length"  # behind the name of a list: that of the field with its length
 _LONGEST_HEADER_LINES: Final = 1000
 
 
@@ -120,11 +124,6 @@ class PlyHeader:
     encoding: str  # a key of _ORDERS
     elements: tuple[tuple[str, int, np.dtype[Any]], ...]  # name, number of rows, type of a row
     comments: tuple[str, ...]  # without the keyword
-
-
-def list_length(name: str) -> str:
-    """Return the name of the field with the length of the list property ``name``."""
-    return f"{name} length"
 
 
 @reader
@@ -173,17 +172,6 @@ def write_table_parts(path: StrPath, elements: Mapping[str, tuple[int, Iterable[
                 stream.write(table.tobytes())
 
 
-def write_table_stream(
-    path: StrPath, name: str, tables: Iterator[Table], comments: Sequence[str]
-) -> int:
-    """Write one element whose rows arrive in parts, atomically; returns how many."""
-
-    def header(rows: int, filler: str, dtype: np.dtype[Any]) -> bytes:
-        return _header([(name, rows, dtype)], [*comments, filler])
-
-    return write_row_stream(path, tables, header)
-
-
 def _header(
     elements: Sequence[tuple[str, int | str, np.dtype[Any]]],
     comments: Sequence[str] = (),
@@ -201,7 +189,7 @@ def _property_lines(dtype: np.dtype[Any]) -> list[str]:
         code = _NAMES[field.base.str[1:]]
         if field.shape:
             lines.append(f"property list uchar {code} {name}")
-        elif list_length(name.removesuffix(" length")) != name:
+        elif not name.endswith(LIST_LENGTH):
             lines.append(f"property {code} {name}")
     return lines
 
@@ -261,7 +249,7 @@ def _property_fields(words: list[str], order: str) -> list[tuple[Any, ...]]:
     name = words[-1]
     if words[0] == "list":
         length, entry = (order + _TYPES[word] for word in words[1:-1])
-        return [(list_length(name), length), (name, entry, (3,))]
+        return [(name + LIST_LENGTH, length), (name, entry, (3,))]
     return [(name, order + _TYPES[words[0]])]
 
 
@@ -271,7 +259,7 @@ def _read_element(
     read = _read_text if encoding == "ascii" else _read_binary
     table = read(stream, count, dtype)
     for field_name, field in _fields(dtype):
-        if field.shape and (table[list_length(field_name)] != 3).any():
+        if field.shape and (table[field_name + LIST_LENGTH] != 3).any():
             raise FormatError("a face is not a triangle", hint="triangulate the mesh first")
     if len(table) < count:
         what, got = f"the file is truncated in its element {name!r}", counted(len(table), "row")
