@@ -97,8 +97,7 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
     """Read one scene of any year.
 
     Raises:
-        FormatError: The folder is not a Middlebury scene, or a file in it is missing, damaged or
-            of another size than the left image.
+        FormatError: The folder is not a scene, or a file is missing, damaged or of another size.
         CalibrationError: The calibration cannot give depth.
     """
     path = resolved(folder)

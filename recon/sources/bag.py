@@ -392,12 +392,8 @@ def _static_transform(bag: Bag, start: str, goal: str) -> Float64 | None:
 def read_measured(path: Path) -> Positions:
     """Read positions of a recording, ``BAG`` or ``BAG:/TOPIC``, or of a file (`read_positions`).
 
-    Messages without a fix are left out; deviations are those of the covariance, NaN where it is
-    unknown. Times are those of the headers, of recording where these have none.
-
-    Raises:
-        ReconError: The file or topic is missing, damaged or without positions; or the recording has
-            several receivers, and no topic is named.
+    Messages without a fix are left out; times are those of the headers, of recording where these
+    have none. What is missing, damaged or not named of several receivers is a `ReconError`.
 
     Ref: ROS, ``sensor_msgs/NavSatFix``; heights are above the ellipsoid of WGS 84.
     """

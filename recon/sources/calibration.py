@@ -34,9 +34,9 @@ def read_rig(
     size: tuple[int, int],
     cameras: tuple[int, int] | None = None,
 ) -> tuple[Rig, tuple[Path, ...]]:
-    """Return the calibration that the settings name or give in numbers, else that of a folder.
+    """Return the calibration of the settings, else of a folder; and its files.
 
-    Also its files. ``size`` is width and height; ``cameras`` are those of a KITTI file, else grey.
+    ``size`` is width and height; ``cameras`` are those of a KITTI file, else grey.
     """
     check_given_once(settings.calibration, settings)
     if settings.numbers:

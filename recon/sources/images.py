@@ -68,9 +68,8 @@ class ImageSource(Recording):
             return FULL_WHITE
         chosen = np.unique(np.linspace(0, len(self.images) - 1, _WHITE_SAMPLE).astype(int))
         frames = [self.images[index] for index in chosen]
-        return find_white(
-            read_levels(p, most) for frame in frames for p in (frame.left, frame.right)
-        )
+        files = (path for frame in frames for path in (frame.left, frame.right))
+        return find_white(read_levels(path, most) for path in files)
 
     @property
     def _most_megapixels(self) -> float:
@@ -116,9 +115,8 @@ def pair_named(
     alone_right = sum(left is None and right is not None for left, right in frames)
     alone = max(len(frames) - whole - alone_right, alone_right)
     check_most(whole, whole + alone, where)
-    return pair_frames(
-        frames, settings, where, [(left or right or Path()).stem for left, right in frames]
-    )
+    names = [(left or right or Path()).stem for left, right in frames]
+    return pair_frames(frames, settings, where, names)
 
 
 def existing(path: Path) -> Path | None:
@@ -226,8 +224,8 @@ def pair_images(left: str | Path, right: str | Path) -> ImagePairs:
     """Pair the images of two cameras; each is a folder, an image or a pattern (``*?[]**``).
 
     Names match if they are equal apart from words and constant numbers of each side, such as
-    ``left01.jpg`` and ``right01.jpg`` or ``cam0/17.png`` and ``cam1/17.png``. If no names match
-    and both sides have as many images, they are paired by order.
+    ``left01.jpg`` and ``right01.jpg``. If none match and both sides have as many, they are paired
+    by order.
     """
     sides = (find_images(left), find_images(right))
     both = set(sides[0]) & set(sides[1])
@@ -267,9 +265,7 @@ def _by_numbers(side: Sequence[Path]) -> dict[_Key, Path]:
     usual = Counter(len(each) for each in numbers.values()).most_common(1)[0][0]
     numbers = {path: each for path, each in numbers.items() if len(each) == usual}
     varying = [k for k in range(usual) if len({each[k] for each in numbers.values()}) > 1]
-    keyed: dict[_Key, Path] = {
-        tuple(each[k] for k in varying): path for path, each in numbers.items()
-    }
+    keyed: dict[_Key, Path] = {tuple(of[k] for k in varying): path for path, of in numbers.items()}
     return keyed if varying and len(keyed) == len(numbers) else {}
 
 

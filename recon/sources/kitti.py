@@ -60,7 +60,15 @@ def open_kitti(folder: Path, settings: SourceSettings | None = None) -> ImageSou
     pair = _choose_cameras(folder, "image_{}")
     settings = settings or SourceSettings()
     views = [folder / f"image_{camera}" for camera in pair]
-    images, listing = _list_pairs(views[0], views[1], settings)
+    names = [{path.name for path in list_images(view)} for view in views]
+    frames = [
+        (
+            views[0] / name if name in names[0] else None,
+            views[1] / name if name in names[1] else None,
+        )
+        for name in sorted(names[0] | names[1], key=natural_key)
+    ]
+    images, listing = pair_named(frames, settings, folder)
     times, time_files = _read_times(folder, listing, settings)
     rig, calibration_files = _read_rig([folder / "calib.txt"], settings, pair, images[0][0])
     truth, pose_files = _read_truth(folder, times, listing, pair[0])
@@ -87,17 +95,6 @@ def _choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
         raise SourceError(what, where=folder, got=names[there[0]], expected=expected)
     expected = f"{names[0]} and {names[1]}, or {names[2]} and {names[3]}"
     raise SourceError("folder has no images in KITTI's layout", where=folder, expected=expected)
-
-
-def _list_pairs(
-    left: Path, right: Path, settings: SourceSettings
-) -> tuple[list[tuple[Path, Path]], FrameList]:
-    names = [{path.name for path in list_images(folder)} for folder in (left, right)]
-    frames = [
-        (left / name if name in names[0] else None, right / name if name in names[1] else None)
-        for name in sorted(names[0] | names[1], key=natural_key)
-    ]
-    return pair_named(frames, settings, left.parent)
 
 
 def _read_times(

@@ -58,7 +58,12 @@ def open_tum(
 ) -> ImageSource:
     """Open a drive with two lists; its images are paired by timestamp."""
     paths = _find_lists(folder, settings)
-    frames, listing = pair_listed([_read_tum_list(path) for path in paths], settings, folder)
+    lists = []
+    for path in paths:
+        entries = read_stamped_names(path)
+        check_seconds(np.array([stamp for stamp, _ in entries]), path)
+        lists.append([(stamp, path.parent / name) for stamp, name in entries])
+    frames, listing = pair_listed(lists, settings, folder)
     rig, texts = read_rig(settings, folder, image_size(frames[0].left, settings))
     truth, note = read_tum_truth(folder, stamps_of(frames))
     return make(
@@ -102,12 +107,6 @@ def _find_lists(folder: Path, settings: SourceSettings) -> tuple[Path, Path]:
     return folder / found[0][0], folder / found[0][1]
 
 
-def _read_tum_list(path: Path) -> list[tuple[float, Path]]:
-    entries = read_stamped_names(path)
-    check_seconds(np.array([stamp for stamp, _ in entries]), path)
-    return [(stamp, path.parent / name) for stamp, name in entries]
-
-
 def is_euroc(folder: Path) -> bool:
     """Return whether a folder has the list of EuRoC's left camera."""
     return (_root(folder) / "cam0" / "data.csv").is_file()
@@ -121,7 +120,13 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
     """Open a drive; its images are paired by timestamp, its ground truth is interpolated."""
     root = _root(folder)
     views = [root / (settings.left or "cam0"), root / (settings.right or "cam1")]
-    frames, listing = pair_listed([_read_euroc_list(view) for view in views], settings, root)
+    lists = []
+    for view in views:
+        if not view.is_dir():
+            raise SourceError("folder of a camera is missing", where=view)
+        entries = read_stamped_names(view / "data.csv", unit_s=NS)
+        lists.append([(stamp, view / "data" / name) for stamp, name in entries])
+    frames, listing = pair_listed(lists, settings, root)
     rig, texts = _read_euroc_rig(root, settings, views, image_size(frames[0].left, settings))
     truth, note = _read_euroc_truth(root, views[0], stamps_of(frames))
     return ImageSource(
@@ -136,13 +141,6 @@ def open_euroc(folder: Path, settings: SourceSettings) -> ImageSource:
         texts=(*texts, *(view / "data.csv" for view in views), *_imu_files(root)),
         imu=partial(_read_imu, root, views[0]) if _imu_files(root) else None,
     )
-
-
-def _read_euroc_list(view: Path) -> list[tuple[float, Path]]:
-    if not view.is_dir():
-        raise SourceError("folder of a camera is missing", where=view)
-    entries = read_stamped_names(view / "data.csv", unit_s=NS)
-    return [(stamp, view / "data" / name) for stamp, name in entries]
 
 
 def _read_euroc_rig(
@@ -182,19 +180,14 @@ def _read_euroc_truth(
     root: Path, left: Path, stamps_s: Float64
 ) -> tuple[SequenceTruth | None, str]:
     path = next((p for name in _TRUTHS if (p := root / name / "data.csv").is_file()), None)
-    T_body_camera = None if path is None else _camera_in_body(root, left)
-    if path is None or T_body_camera is None:
+    if path is None:
         return None, ""
-    return truth_at(read_euroc_truth(path), stamps_s, T_body_camera)
-
-
-def _camera_in_body(root: Path, left: Path) -> Float64 | None:
-    """Return ``T_body_camera`` of the left camera; without a file of its own the body is the IMU.
-
-    Ref: Schubert et al., "The TUM VI benchmark for evaluating visual-inertial odometry", IROS 2018.
-    """
     sensor, chain = left / "sensor.yaml", _chain(root)
     if sensor.is_file():
-        return read_euroc_camera(sensor)[1]
-    T_camera_imu = None if chain is None else read_kalibr_imu(chain)
-    return None if T_camera_imu is None else invert(T_camera_imu)
+        T_body_camera = read_euroc_camera(sensor)[1]
+    else:  # in TUM VI the body is the inertial unit (Schubert et al., IROS 2018)
+        T_camera_imu = None if chain is None else read_kalibr_imu(chain)
+        if T_camera_imu is None:
+            return None, ""
+        T_body_camera = invert(T_camera_imu)
+    return truth_at(read_euroc_truth(path), stamps_s, T_body_camera)

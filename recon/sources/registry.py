@@ -47,8 +47,7 @@ KINDS: Final = (
     Kind("video", "videos", open_video_source, lambda at, _: list_videos(at), VIDEOS),
     Kind("folders", _PLAIN, open_folders, find_views),
 )
-"""The most distinctive first: what `recon capture` wrote is listed in a file, and may look like
-others."""
+"""The most distinctive first: what `recon capture` wrote has a list, and may look like others."""
 _NAMELESS: Final = frozenset({"kitti", "kitti-raw", "middlebury"})  # their layouts name the cameras
 
 

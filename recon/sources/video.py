@@ -132,9 +132,8 @@ def open_videos(files: Sequence[Path]) -> tuple[VideoFile, ...]:
 
 def list_videos(folder: Path) -> list[str]:
     """Return names of the video files in a folder."""
-    return sorted(
-        path.name for path in folder.iterdir() if path.suffix.lower() in VIDEOS and path.is_file()
-    )
+    files = (path for path in folder.iterdir() if path.suffix.lower() in VIDEOS)
+    return sorted(path.name for path in files if path.is_file())
 
 
 def view_size(video: VideoFile, settings: SourceSettings) -> tuple[int, int]:

@@ -22,7 +22,6 @@ from recon.core.values import (
     check_side_by_side,
     check_size,
 )
-from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.opencv_yaml import INSTEAD, read_opencv_calibration
@@ -114,16 +113,13 @@ def _read_camera(fields: Fields) -> CameraIntrinsics:
     if model not in _NAMES:
         raise FormatError("unknown lens model", got=model, expected="pinhole or fisheye")
     fx, fy, cx, cy = (fields.number(name) for name in ("fx_px", "fy_px", "cx_px", "cy_px"))
-    distortion = _read_distortion(fields.below("distortion"), _NAMES[model])
-    size = fields.count("width_px"), fields.count("height_px")
-    return CameraIntrinsics(pinhole_matrix(fx, fy, cx, cy), distortion, *size, model)
-
-
-def _read_distortion(fields: Fields, names: tuple[str, ...]) -> Float64:
-    known = [name for name in names if name in fields]
+    given, names = fields.below("distortion"), _NAMES[model]
+    known = [name for name in names if name in given]
     if known != list(names[: len(known)]):
         raise FormatError("distortion has gaps", got=", ".join(known), expected=", ".join(names))
-    return np.array([fields.number(name) for name in known], dtype=np.float64)
+    distortion = np.array([given.number(name) for name in known], dtype=np.float64)
+    size = fields.count("width_px"), fields.count("height_px")
+    return CameraIntrinsics(pinhole_matrix(fx, fy, cx, cy), distortion, *size, model)
 
 
 _COMMA, _POINT = re.compile(r"\d,\d"), re.compile(r"^[^%<\n]*\d\.", re.MULTILINE)
@@ -159,16 +155,15 @@ def read_calibration(
     """Read the calibration of images of one size from a file of any supported format.
 
     Supported are our own YAML, KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt`` (its rectified or
-    raw ``cameras``, according to the image size; None = the grey pair if it has one), Middlebury's
+    raw ``cameras``, by the image size; None = the grey pair if it has one), Middlebury's
     ``calib.txt``, OpenCV's ``FileStorage`` files (translation in so many ``metres_per_unit``), ROS
-    CameraInfo (either of the two files; the other is expected in the same folder), and kalibr's
-    camera chain. Rectified images give a `RectifiedCamera`.
+    CameraInfo (one of two files in a folder), and kalibr's camera chain. Rectified images give a
+    `RectifiedCamera`.
 
     Raises:
-        FormatError: The file is missing, damaged or of an unknown format, or it does not contain
-            the image size (KITTI's and some of OpenCV's do not) and none is given.
-        CalibrationError: The calibration cannot give depth, such as one with left and right
-            swapped, or is of another image size.
+        FormatError: The file is missing, damaged or of an unknown format, or no image size is
+            known.
+        CalibrationError: It cannot give depth, or is of another image size.
     """
     size = None if width_px is None or height_px is None else (width_px, height_px)
     if is_zipfile(path):

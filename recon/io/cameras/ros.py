@@ -114,8 +114,8 @@ def are_rectified(
 ) -> bool:
     """Return whether images of a size (width, height) are what both ``P`` are of, and no ``K``.
 
-    What writes rectified images may state ``K`` and ``D`` of the cameras, whose images were larger,
-    as kitti2bag does, under the ``stated`` size (0 = none) of either.
+    Rectified images may come with ``K`` and ``D`` of larger raw ones, as kitti2bag writes them,
+    under the ``stated`` size (0 = none) of either.
     """
 
     def off(both: tuple[Float64, Float64], of: tuple[int, int]) -> float:

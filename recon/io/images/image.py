@@ -64,13 +64,12 @@ def read_image(
 ) -> UInt8:
     """Read PNG, JPEG, PGM, PPM, BMP or TIFF: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
-    16 bits are scaled to 8, linearly: ``white``, the same for all images of a drive (`find_white`),
-    becomes 255. An alpha channel is dropped. The EXIF orientation is ignored: a calibration refers
-    to the pixels as the sensor recorded them.
+    16 bits are scaled to 8: ``white`` (`find_white`) becomes 255. Alpha is dropped; the EXIF
+    orientation is ignored, as a calibration refers to the pixels as the sensor recorded them.
 
     Raises:
-        FormatError: The file is missing, empty, truncated, not an image, has more than
-            ``max_megapixels`` (10⁶ pixels), or floating-point pixels.
+        FormatError: The file is missing, truncated, not an image, has more than ``max_megapixels``
+            (10⁶ pixels), or floating-point pixels.
     """
     return eight_bits(read_levels(path, max_megapixels), white)
 
@@ -195,7 +194,7 @@ def pixels_of_ros_image(
 ) -> UInt8:
     """Decode the bytes (N,) of a ROS image message: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
-    Rows are ``step`` bytes long. 16-bit pixels are scaled over their full range to 8 bits.
+    Rows are ``step`` bytes long; 16-bit pixels are scaled over their full range.
 
     Ref: ``sensor_msgs/image_encodings.hpp``.
     """
