@@ -102,7 +102,7 @@ def capture_pairs(
 ) -> Iterator[CapturedPair]:
     """Yield pairs until the limit is reached, a file ends, or ``stopped`` returns True.
 
-    If one camera loses a frame, the other drops its frame too, so that pairs are nearest in time.
+    Where one camera loses a frame, the other drops its own, so that pairs are nearest in time.
     """
     known_hz = [camera.rate_hz for camera in cameras if np.isfinite(camera.rate_hz)]
     period_s = 1 / (settings.rate_hz or min(known_hz, default=_USUAL_RATE_HZ))

@@ -1,8 +1,4 @@
-"""Rectification without a calibration: the simplest change that aligns rows; its scale is unknown.
-
-The images as they are, a small rotation of the right camera, or homographies from the fundamental
-matrix of the two views.
-"""
+"""Rectification without a calibration: the simplest change that aligns rows; up to scale."""
 
 from __future__ import annotations
 
@@ -94,7 +90,7 @@ def rectify_features(
 ) -> UncalibratedRectification:
     """Find the simplest change whose held-out row errors are not clearly above the smallest.
 
-    Held out are every second pair or, of fewer than four, every fourth feature. ``min_features``
+    Held out are every second pair or, of fewer than four, every fourth feature; ``min_features``
     must agree on homographies.
     """
     features = pool_features(matched)
@@ -114,7 +110,13 @@ def rectify_features(
     before = _row_errors(fits["raw"], features)
     for name, H in fits.items():
         after = _row_errors(H, features)
-        if name not in blocks or _clearly_above(blocks[name], best) or after.sum() > before.sum():
+        if name not in blocks or after.sum() > before.sum():
+            continue
+        # Clearly above: by two standard errors, and by what features resolve.
+        more = blocks[name] - best
+        deviation = float(more.std(ddof=1)) if len(more) > 1 else 0.0
+        resolved = max(2 * deviation / max(len(more), 1) ** 0.5, _RESOLVED_PX)
+        if len(more) and more.mean() > resolved:
             continue
         # A model that is no homography has to hold for most matches, else there is no geometry.
         enough = 1 if name == "homographies" else max(_MIN_FEATURES, len(features) / 2)
@@ -186,13 +188,6 @@ def _row_errors(H: Homographies, features: PairFeatures) -> Float64:
     return np.minimum(np.abs(left[:, 1] - right[:, 1]), 4 * _INLIER_PX)
 
 
-def _clearly_above(errors: Float64, best: Float64) -> bool:
-    """Return whether errors exceed the best by two standard errors and what features resolve."""
-    more = errors - best
-    deviation = float(more.std(ddof=1)) if len(more) > 1 else 0.0
-    return len(more) > 0 and bool(more.mean() > max(2 * deviation / len(more) ** 0.5, _RESOLVED_PX))
-
-
 def _result(
     model: str, H: Homographies, features: PairFeatures, held_out: Float64
 ) -> UncalibratedRectification:
@@ -216,8 +211,8 @@ def _result(
 def rectifying_homographies(F: Float64, features: PairFeatures, size: Size) -> Homographies:
     """Return float64 (3, 3) for the left and for the right image, which align matching rows.
 
-    Borders stay as near to their places as aligned rows allow, then the right image is shifted so
-    that disparities are positive. The matches are correct ones, ``right.T @ F @ left = 0``.
+    Borders stay as near to their places as aligned rows allow; disparities are positive. The
+    matches are correct ones, ``right.T @ F @ left = 0``.
 
     Ref: Hartley 1999, "Theory and practice of projective rectification", as OpenCV has it.
     """
@@ -297,8 +292,7 @@ def find_fundamental(features: PairFeatures, inlier_px: float) -> tuple[Float64 
 def fit_fundamental(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
     """Refine a fundamental matrix, minimising the absolute distances of inliers (N, 2).
 
-    Ref: Bartoli and Sturm 2004, "Non-linear estimation of the fundamental matrix with minimal
-    parameters".
+    Ref: Bartoli and Sturm 2004, "Non-linear estimation of the fundamental matrix".
     """
     middle = np.concatenate([left_px, right_px]).mean(axis=0)
     scale = 1.0 / max(float(np.abs([left_px - middle, right_px - middle]).mean()), 1e-12)

@@ -60,7 +60,7 @@ def write_rig(
     """Write a rig, each file atomically, and return the files: two of ROS, else one.
 
     ``settings`` are those of the rectification that a CameraInfo states; only our own files keep
-    the ``quality``. A form of None is that of the name.
+    the ``quality``; a form of None is that of the name.
     """
     form = form or form_of(path)
     if form == "recon":

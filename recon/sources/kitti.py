@@ -60,14 +60,9 @@ def open_kitti(folder: Path, settings: SourceSettings | None = None) -> ImageSou
     pair = _choose_cameras(folder, "image_{}")
     settings = settings or SourceSettings()
     views = [folder / f"image_{camera}" for camera in pair]
-    names = [{path.name for path in list_images(view)} for view in views]
-    frames = [
-        (
-            views[0] / name if name in names[0] else None,
-            views[1] / name if name in names[1] else None,
-        )
-        for name in sorted(names[0] | names[1], key=natural_key)
-    ]
+    left, right = ({path.name: path for path in list_images(view)} for view in views)
+    names = sorted(left.keys() | right.keys(), key=natural_key)
+    frames = [(left.get(name), right.get(name)) for name in names]
     images, listing = pair_named(frames, settings, folder)
     times, time_files = _read_times(folder, listing, settings)
     rig, calibration_files = _read_rig([folder / "calib.txt"], settings, pair, images[0][0])

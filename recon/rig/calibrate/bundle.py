@@ -1,8 +1,7 @@
 """Bundle adjustment of the lenses, the pose of the right camera and every pose of the board.
 
 One solver handles one or two cameras, any lens, and partly visible boards. Board poses are
-eliminated view by view (Schur complement), which leaves each view's information about the shared
-parameters, which the bootstrap reweights.
+eliminated view by view (Schur complement); the bootstrap reweights what is left of each view.
 
 Ref: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6; Zhang 2000.
 """
@@ -210,8 +209,8 @@ def _cost(corners: Sequence[_Corners], state: RigState, weights: Float64) -> flo
 def _without_poses(normals: Float64, damping: float = 0.0) -> tuple[Float64, Float64, Float64]:
     """Eliminate the pose of the board from the normal equations of each view.
 
-    Returns matrices (V, P, P) and vectors (V, P) of the shared parameters, and (V, 6, P + 1), from
-    which the pose's step follows: the last column less the others times the step of the shared.
+    Returns matrices (V, P, P) and vectors (V, P) of the shared parameters, and (V, 6, P + 1): the
+    step of the pose is the last column less the others times that of the shared parameters.
     """
     P = normals.shape[1] - _POSE - 1
     shared, own = normals[:, :P], normals[:, P:-1]

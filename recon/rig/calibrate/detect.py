@@ -44,12 +44,19 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
     A chessboard must be fully visible, a ChArUco board may be partly visible.
     """
     if board.kind == "charuco":
-        numbers, pixels = _find_charuco(grey, board)
+        corners, found_numbers, *_ = cv2.aruco.CharucoDetector(_charuco(board)).detectBoard(grey)
+        if found_numbers is None:
+            return None
+        numbers = np.asarray(found_numbers, dtype=np.int32).ravel()
+        pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
     else:
         found = _find_chessboard(grey, board.inner)
         pixels = np.zeros((0, 2)) if found is None else found
         numbers = np.arange(len(pixels), dtype=np.int32)
-    if not _enough(numbers, board):
+    if len(numbers) < min(_FEWEST_CORNERS, len(board.corners_m)):
+        return None
+    flat = board.corners_m[numbers, :2]
+    if np.linalg.matrix_rank(flat - flat.mean(axis=0), tol=1e-9 * board.square_m) < 2:
         return None
     # The edges of the markers must stay outside the window.
     free = (board.square_m - board.marker_m) / (2 * board.square_m)
@@ -61,8 +68,8 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
 def orient_like(reference: Float64, pixels: Float64, inner: Inner) -> Float64:
     """Reorder the corners (N, 2) of a whole chessboard as in another view of it.
 
-    OpenCV may start at any corner of the board. Of all orders that preserve neighbours, this takes
-    the one that resembles the reference most, up to translation and scale.
+    OpenCV may start at any corner of the board. Of all orders that preserve neighbours, this is the
+    one that resembles the reference most, up to translation and scale.
     """
     columns, rows = inner
     grid = np.arange(columns * rows).reshape(rows, columns)
@@ -103,13 +110,6 @@ def _refine_corners(
     return np.where(lost[..., None], start, refined).reshape(-1, 2).astype(np.float64)
 
 
-def _enough(numbers: Int32, board: CalibrationBoard) -> bool:
-    if len(numbers) < min(_FEWEST_CORNERS, len(board.corners_m)):
-        return False
-    flat = board.corners_m[numbers, :2]
-    return bool(np.linalg.matrix_rank(flat - flat.mean(axis=0), tol=1e-9 * board.square_m) == 2)
-
-
 def _spacing(numbers: Int32, pixels: Float64, board: CalibrationBoard) -> float:
     """Return the smallest distance between neighbouring corners of the board, pixels."""
     columns = board.inner[0]
@@ -135,7 +135,16 @@ def check_chessboard(
     claimed = _sorted(board.inner)
     seen = Counter(_sorted(size) for size in sizes if size is not None)
     if not seen:
-        _check_no_markers([read(n) for n in _spread(range(len(sizes)), _PROBED_MARKERS)], board)
+        probes = [read(n) for n in _spread(range(len(sizes)), _PROBED_MARKERS)]
+        best, counts = _marker_votes(probes)
+        if counts[best] >= _SURE * len(probes):
+            raise CalibrationError(
+                "the images show a board with markers (ChArUco)",
+                got=f"markers of {best.lower()}",
+                expected=str(board),
+                hint=f"try --board charuco:COLUMNSxROWS:SQUARE:MARKER:{best.lower()}, "
+                "counting squares",
+            )
     probed: list[Inner | None] = []
     if 2 * seen.total() < len(sizes):
         # The few detections may be parts of a larger board.
@@ -169,7 +178,8 @@ def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBo
         raise CalibrationError(
             "markers were found, but not in the layout of this board",
             got=f"marker ids up to {numbers.max()}",
-            expected=f"0 to {_marker_count(board) - 1} for {board.columns}x{board.rows} squares",
+            expected=f"0 to {math.prod(board.squares) // 2 - 1} for {board.columns}x{board.rows} "
+            "squares",
             hint="count squares, not corners; give columns first",
         )
     plain = [size for size in map(_probe_size, probed) if size is not None]
@@ -266,17 +276,6 @@ def _sample(grey: UInt8, places: Float64) -> Float64:
     return np.where(inside, grey[y, x].astype(np.float64), np.nan)
 
 
-def _check_no_markers(images: Sequence[UInt8], board: CalibrationBoard) -> None:
-    best, votes = _marker_votes(images)
-    if votes[best] >= _SURE * len(images):
-        raise CalibrationError(
-            "the images show a board with markers (ChArUco)",
-            got=f"markers of {best.lower()}",
-            expected=str(board),
-            hint=f"try --board charuco:COLUMNSxROWS:SQUARE:MARKER:{best.lower()}, counting squares",
-        )
-
-
 def _wrong_size(size: Inner, where: str, board: CalibrationBoard) -> CalibrationError:
     columns, rows = size if board.columns <= board.rows else size[::-1]
     claimed = f"{board.columns}x{board.rows}"
@@ -303,32 +302,17 @@ def dark_rectangles(board: CalibrationBoard) -> Float64:
     if board.kind == "chess":
         return np.asarray(np.hstack([low - 1.0, low]) * board.square_m)
     charuco, low = _charuco(board), low * board.square_m
-    markers = [
-        _marker_cells(board, int(number), np.asarray(corners)[:, :2])
-        for number, corners in zip(charuco.getIds().ravel(), charuco.getObjPoints(), strict=True)
-    ]
-    cells = np.concatenate([np.hstack([low, low + board.square_m]), *markers])
-    return np.asarray(cells - board.square_m)
-
-
-def _marker_cells(board: CalibrationBoard, number: int, corners: Float64) -> Float64:
-    """Return float64 (M, 4), dark cells of the marker with the given corners (4, 2), metres."""
+    cells = [np.hstack([low, low + board.square_m])]
     dictionary = _dictionary(board.dictionary)
-    cells = dictionary.markerSize + 2
-    bits = cv2.aruco.generateImageMarker(dictionary, number, cells)
-    rows, columns = np.nonzero(bits == 0)
-    step = board.marker_m / cells
-    low = corners.min(axis=0) + np.stack([columns, rows], axis=1) * step
-    return np.asarray(np.hstack([low, low + step]))
-
-
-def _find_charuco(grey: UInt8, board: CalibrationBoard) -> tuple[Int32, Float64]:
-    """Return the numbers of the corners that are seen, int32 (N,), and their pixels (N, 2)."""
-    corners, numbers, *_ = cv2.aruco.CharucoDetector(_charuco(board)).detectBoard(grey)
-    if numbers is None:
-        return np.zeros(0, dtype=np.int32), np.zeros((0, 2))
-    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-    return np.asarray(numbers, dtype=np.int32).ravel(), pixels
+    side = dictionary.markerSize + 2  # cells of a marker
+    for number, corners in zip(charuco.getIds().ravel(), charuco.getObjPoints(), strict=True):
+        bits = cv2.aruco.generateImageMarker(dictionary, int(number), side)
+        down, across = np.nonzero(bits == 0)
+        step = board.marker_m / side
+        first = np.asarray(corners)[:, :2].min(axis=0)
+        low = first + np.stack([across, down], axis=1) * step
+        cells.append(np.hstack([low, low + step]))
+    return np.asarray(np.concatenate(cells) - board.square_m)
 
 
 def _find_markers(grey: UInt8, dictionary: str) -> Int32:
@@ -346,10 +330,6 @@ def _dictionaries() -> list[str]:
     return sorted({n[len(_PREFIX) :].upper() for n in dir(cv2.aruco) if n.startswith(_PREFIX)})
 
 
-def _marker_count(board: CalibrationBoard) -> int:
-    return math.prod(board.squares) // 2
-
-
 def _dictionary(name: str) -> Any:
     number = getattr(cv2.aruco, f"{_PREFIX}{name}", None)
     if number is None:
@@ -361,11 +341,11 @@ def _dictionary(name: str) -> Any:
 @lru_cache(maxsize=4)
 def _charuco(board: CalibrationBoard) -> Any:
     dictionary = _dictionary(board.dictionary)
-    if len(dictionary.bytesList) < _marker_count(board):
+    if len(dictionary.bytesList) < math.prod(board.squares) // 2:
         raise SettingsError(
             "dictionary has too few markers for the board",
             got=f"{board.dictionary.lower()} with {len(dictionary.bytesList)}",
-            expected=f"at least {_marker_count(board)}",
+            expected=f"at least {math.prod(board.squares) // 2}",
         )
     size = (board.columns, board.rows)
     charuco = cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)

@@ -132,7 +132,14 @@ def _group_views(views: Sequence[View]) -> list[list[View]]:
         if same is None:
             groups.append(same := [])
         same.append(view)
-    return [_middle_first(group) for group in groups]
+    ordered = []
+    for group in groups:
+        # First the view that is nearest to a few of the others.
+        some = group[:: max(1, len(group) // 8)]
+        apart = [max(_moved(view, other) for other in some) for view in group]
+        middle = int(np.argmin(apart)) if len(group) > 2 else 0
+        ordered.append([group[middle], *group[:middle], *group[middle + 1 :]])
+    return ordered
 
 
 def _moved(first: View, second: View) -> float:
@@ -148,15 +155,6 @@ def _shift(first: Sighting, second: Sighting) -> float:
         a, b = a[here], b[there]
     # A chessboard turned by 180 degrees looks the same, and its corners may begin at either end.
     return min(_length_rms(a - b), _length_rms(a - b[::-1])) / _length_rms(a - a.mean(axis=0))
-
-
-def _middle_first(group: list[View]) -> list[View]:
-    """Return the group with the view first that is nearest to a few of the others."""
-    if len(group) < 3:
-        return group
-    some = group[:: max(1, len(group) // 8)]
-    middle = int(np.argmin([max(_moved(view, other) for other in some) for view in group]))
-    return [group[middle], *group[:middle], *group[middle + 1 :]]
 
 
 def _check_count(
@@ -240,22 +238,20 @@ def _guess_fisheye(sightings: Sequence[Sighting], size: Size) -> RigState:
 
 
 def _with_poses(camera: CameraIntrinsics, sightings: Sequence[Sighting]) -> RigState:
-    poses = np.stack([_locate_board(camera, seen) for seen in sightings])
-    return RigState((camera,), (np.eye(4),), poses)
-
-
-def _locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
-    rays = rays_of(camera, seen.pixels)
-    known = np.isfinite(rays).all(axis=1)
-    try:
-        done, rotation, shift = cv2.solvePnP(
-            seen.board_m[known], rays[known, :2], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
-    except cv2.error as error:
-        raise CalibrationError("no pose of the board fits", got=error.err) from error
-    if not done or not np.isfinite(shift).all():
-        raise CalibrationError("no pose of the board fits")
-    return make_transform(cv2.Rodrigues(rotation)[0], shift.ravel())
+    poses = []
+    for seen in sightings:
+        rays = rays_of(camera, seen.pixels)
+        known = np.isfinite(rays).all(axis=1)
+        try:
+            done, rotation, shift = cv2.solvePnP(
+                seen.board_m[known], rays[known, :2], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+            )
+        except cv2.error as error:
+            raise CalibrationError("no pose of the board fits", got=error.err) from error
+        if not done or not np.isfinite(shift).all():
+            raise CalibrationError("no pose of the board fits")
+        poses.append(make_transform(cv2.Rodrigues(rotation)[0], shift.ravel()))
+    return RigState((camera,), (np.eye(4),), np.stack(poses))
 
 
 def _join_cameras(left: RigState, right: RigState) -> RigState:
@@ -319,7 +315,12 @@ def _resample(fit: StereoFit) -> list[StereoCalibration]:
     """Return rigs calibrated from bootstrap resamples of the views; failed ones are left out."""
     rng = np.random.default_rng(0)
     count, info = len(fit.views), fit.information
-    vectors = _jackknife_vectors(fit)
+    # (V, P): the gradient of each view, corrected for its own effect on the solution, as
+    # (1 - M / W)^-1 v = W (W - M)^-1 v: well conditioned although the parameters differ in size.
+    # Ref: Bell and McCaffrey 2002, "Bias reduction in standard errors" (their jackknife form).
+    whole = info.prior + info.matrices.sum(axis=0)
+    each = zip(info.matrices, info.vectors, strict=True)
+    vectors = np.array([whole @ solve_scaled(whole - matrix, vector) for matrix, vector in each])
     rigs = []
     for _ in tracked(range(_RESAMPLES), "samples"):
         drawn = rng.multinomial(count, np.full(count, 1 / count)).astype(np.float64)
@@ -354,8 +355,7 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
 def _working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
     """Return the distance at which depth matters: by default, where matching errs by 2 %.
 
-    Errors of calibration grow with its square as well: it is the same to ask there whether the
-    calibration is as good as the matching.
+    Errors of calibration grow with its square as well: the comparison of both is the same anywhere.
     """
     usual_m = _MATCHED * float(rig.left.matrix[0, 0]) * rig.baseline_m / MATCH_SIGMA_PX
     return usual_m if settings.working_m is None else settings.working_m
@@ -371,18 +371,6 @@ def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -
     aa, ab, bb = (np.einsum("ni,ni->n", p, q) for p, q in ((a, a), (a, b), (b, b)))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray((bb * (a @ c) - ab * (b @ c)) / (aa * bb - ab**2))
-
-
-def _jackknife_vectors(fit: StereoFit) -> Float64:
-    """Return float64 (V, P), each view's gradient, corrected for its own effect on the solution.
-
-    Ref: Bell and McCaffrey 2002, "Bias reduction in standard errors" (their jackknife form).
-    """
-    info = fit.information
-    whole = info.prior + info.matrices.sum(axis=0)
-    # (1 - M / W)^-1 v = W (W - M)^-1 v: well conditioned although the parameters differ in size.
-    each = zip(info.matrices, info.vectors, strict=True)
-    return np.array([whole @ solve_scaled(whole - matrix, vector) for matrix, vector in each])
 
 
 def _interval(values: list[float]) -> tuple[float, float]:
