@@ -52,8 +52,8 @@ def evaluate_map(
 ) -> MapMetrics:
     """Compare a cloud with a reference in the same frame.
 
-    Both clouds are first reduced to one point per voxel, so that dense regions do not dominate: a
-    stereo cloud has a hundred times more points on a wall at 3 m than on one at 30 m.
+    Both are first reduced to one point per voxel, so that dense regions do not dominate: a stereo
+    cloud has a hundred times more points on a wall at 3 m than on one at 30 m.
 
     Args:
         cloud: The estimate.
@@ -89,7 +89,6 @@ def within_reach(cloud: PointCloud, reference: PointCloud, path: Trajectory) -> 
     """Return which points are within the heights, relative to the path, that the reference covers.
 
     A LiDAR sees little above its own height: points there can be neither confirmed nor refuted.
-    The range is that of the whole reference, so that points floating above a road still count.
     """
     low_m, high_m = np.percentile(_heights_m(reference.xyz, path), _BAND_PERCENT)
     heights_m = _heights_m(cloud.xyz, path)
@@ -242,8 +241,7 @@ def place_cloud(
 ) -> tuple[MappedCloud, dict[str, Any]]:
     """Bring a map into the axes of its reference; also return how it was aligned.
 
-    ``align_to`` are true poses of the run's cameras in these axes, to which its path is aligned
-    rigidly.
+    ``align_to`` are true poses of the run's cameras in these axes, to which its path is aligned.
     """
     if frame == "map" and align_to is not None:
         what = "--align-to needs a reference in the axes of the poses"
@@ -282,33 +280,26 @@ def place_by_icp(
 ) -> tuple[MappedCloud, dict[str, Any]]:
     """Bring a map into the axes of its reference (`place_cloud`), and align it there by ICP.
 
-    Of several ``frames``, the cloud is placed where most of its points have a partner within
-    ``reach_m``: ``reference_frame`` of how it was aligned.
+    Of several ``frames`` it is that in which most points have a partner within ``reach_m``.
     """
     found: list[tuple[MappedCloud, dict[str, Any]]] = []
     for frame in frames:
         placed, how = place_cloud(mapped, frame, align_to)
+        cloud, axes = placed.cloud, placed.cloud.frame
         try:
-            fitted, moved = _fit_cloud(placed, reference, reach_m)
+            T, share = register_cloud(cloud, replace(reference, frame=axes), reach_m)
         except RegistrationError:
             if frame == frames[-1] and not found:
                 raise
-        else:
-            found.append((fitted, {**how, "reference_frame": frame, **moved}))
+            continue
+        # Measured at the centre of the map: a rotation about a far origin would look like a shift.
+        middle = np.eye(4)
+        middle[:3, 3] = cloud.xyz.mean(axis=0, dtype=np.float64)
+        moved = {**_size("icp", invert(middle) @ T @ middle), "icp_share": share}
+        cloud, path = transform_cloud(cloud, T, frame=axes), _moved(placed.path, T)
+        fitted = replace(placed, cloud=cloud, path=path)
+        found.append((fitted, {**how, "reference_frame": frame, **moved}))
     return max(found, key=lambda each: each[1]["icp_share"])
-
-
-def _fit_cloud(
-    mapped: MappedCloud, reference: PointCloud, reach_m: float
-) -> tuple[MappedCloud, dict[str, Any]]:
-    reference = replace(reference, frame=mapped.cloud.frame)
-    T, share = register_cloud(mapped.cloud, reference, reach_m)
-    # Measured at the centre of the map: a rotation about a far origin would look like a shift.
-    middle = np.eye(4)
-    middle[:3, 3] = mapped.cloud.xyz.mean(axis=0, dtype=np.float64)
-    figures = {**_size("icp", invert(middle) @ T @ middle), "icp_share": share}
-    cloud = transform_cloud(mapped.cloud, T, frame=mapped.cloud.frame)
-    return replace(mapped, cloud=cloud, path=_moved(mapped.path, T)), figures
 
 
 def add_within_reach(
@@ -402,8 +393,8 @@ def compare_with_truth(
 ) -> DriveErrors:
     """Compare a mapped drive and its grid with the truth that its source knows.
 
-    ``true_path`` is that of the camera of the map. Poses that were given are no estimate, and 0 %
-    drift would mislead: the paths are not compared.
+    ``true_path`` is that of the camera of the map. Poses that were given are no estimate: a drift
+    of 0 % would mislead.
     """
     warnings: list[str] = []
 

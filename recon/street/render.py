@@ -316,12 +316,9 @@ class Stage:
 
         They go on where those of a mirror, ``beyond``, end.
         """
-        start = (
-            origin
-            if beyond is None
-            else origin + directions * self._along(beyond)[:, None] / _SIGHT
-        )
-        rays = np.arange(len(directions)) if beyond is None else beyond.rays
+        start, rays = origin, np.arange(len(directions))
+        if beyond is not None:
+            start, rays = origin + directions * self._along(beyond)[:, None] / _SIGHT, beyond.rays
         seen = Sight(rays, origin, directions, self.rays.first_hit(start, directions))
         mirror = (seen.faces >= 0) & (self.soup.material[seen.faces] == Material.MIRROR)
         if not bounces:

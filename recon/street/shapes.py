@@ -126,13 +126,7 @@ def bumpy_ball(radii_m: Any, paint: Paint, *, bump: float, wavelength: float) ->
 
 @cache
 def _icosphere_corners(splits: int) -> tuple[Float64, NDArray[np.int64]]:
-    """Return the different corners (N, 3) of a unit sphere, and which its faces have."""
-    flat, places = np.unique(icosphere(splits).reshape(-1, 3), axis=0, return_inverse=True)
-    return flat, places.ravel()
-
-
-def icosphere(splits: int) -> Float64:
-    """Return triangles (20·4^splits, 3, 3) of a unit sphere."""
+    """Return corners (N, 3) of a unit sphere of 20·4^splits triangles, and which those have."""
     g = (1.0 + 5.0**0.5) / 2.0
     flat = np.array([[-1, g, 0], [1, g, 0], [-1, -g, 0], [1, -g, 0]])
     # Three golden rectangles, one in each coordinate plane.
@@ -147,7 +141,8 @@ def icosphere(splits: int) -> Float64:
         ab, bc, ca = _unit(a + b), _unit(b + c), _unit(c + a)
         children = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
         corners = np.concatenate([np.stack(child, axis=1) for child in children])
-    return corners
+    flat, places = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return flat, places.ravel()
 
 
 def _unit(v: NDArray[Any]) -> Float64:
