@@ -15,7 +15,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair, check_size
-from recon.core.values.arrays import Bool, Float32, UInt8, size_text
+from recon.core.values.arrays import Float32, UInt8, size_text
 from recon.io.fields import Fields
 from recon.io.files import StrPath, read_table, read_text, reader, resolved
 from recon.io.images.disparity import read_disparity_png, read_pfm
@@ -256,10 +256,7 @@ def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> 
 def _read_truth(
     folder: Path, layout: Layout, levels: float | None, shape: tuple[int, int]
 ) -> DisparityTruth | None:
-    """Read the truth of the left image, and which pixels both cameras see.
-
-    By a mask, else where the true disparities of both images agree, else everywhere.
-    """
+    """Read the truth of the left image, and by a mask or that of the right one what both see."""
     values = _read_disparity(folder, layout.truth_left, levels, shape)
     if values is None:
         return None
@@ -270,17 +267,15 @@ def _read_truth(
         _check_shape(mask, grey, shape)
         seen = np.asarray(grey == _SEEN_BY_BOTH)
     elif (right := _read_disparity(folder, layout.truth_right, levels, shape)) is not None:
-        seen = cross_check(values, right, _TOLERANCE_PX)
+        # Where both disparities describe the same point.
+        width = values.shape[1]
+        columns = np.rint(np.arange(width) - np.nan_to_num(values, nan=2.0 * width)).astype(
+            np.int64
+        )
+        inside = (columns >= 0) & (columns < width)
+        there = np.take_along_axis(right, np.clip(columns, 0, width - 1), axis=1)
+        seen = np.asarray(inside & (np.abs(there - values) <= _TOLERANCE_PX))
     return DisparityTruth(values, np.isfinite(values) & seen)
-
-
-def cross_check(left: Float32, right: Float32, tolerance_px: float) -> Bool:
-    """Return bool (H, W), where both disparities ``x_left - x_right`` describe the same point."""
-    height, width = left.shape
-    columns = np.rint(np.arange(width) - np.nan_to_num(left, nan=2.0 * width)).astype(np.int64)
-    inside = (columns >= 0) & (columns < width)
-    there = right[np.arange(height)[:, None], np.clip(columns, 0, width - 1)]
-    return np.asarray(inside & (np.abs(there - left) <= tolerance_px))
 
 
 def _read_disparity(

@@ -235,11 +235,9 @@ def reordered(path: Trajectory) -> Trajectory:
 
 
 def _check_order(path: Trajectory, where: StrPath) -> None:
-    """Refuse orientations that the path follows only with their quaternions in the other order.
-
-    A rig that moves along one of its own directions does so in one order alone, once it turns; of
-    one that stands, goes straight or is carried anyhow, both orders say the same.
-    """
+    """Refuse orientations that the path follows only with their quaternions in the other order."""
+    # A rig that moves along one of its own directions does so in one order alone, once it turns; of
+    # one that stands, goes straight or is carried anyhow, both orders say the same.
     apart_rad, other_rad = _wander_rad(path), _wander_rad(reordered(path))
     if apart_rad > max(_WANDERS_RAD, _MUCH * other_rad):
         apart, other = (f"{np.degrees(angle):.1f} deg" for angle in (apart_rad, other_rad))

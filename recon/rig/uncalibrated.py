@@ -234,11 +234,7 @@ def rectifying_homographies(F: Float64, features: PairFeatures, size: Size) -> H
 
 
 def _levelled(views: list[Float64], border: Float64) -> list[Float64]:
-    """Tilt both images together about a horizontal axis, until top and bottom have equal scale.
-
-    Rows stay aligned under (x, y) -> (x, y) / (1 + g·(y - y0)); g makes the third coordinates as
-    even as possible along the borders of both images.
-    """
+    """Tilt both images together about a horizontal axis, until top and bottom have equal scale."""
     points = np.hstack([border, np.ones((len(border), 1))])
     views = [H / (points @ H[2]).mean() for H in views]
     for side, H in zip(("left", "right"), views, strict=True):
@@ -255,6 +251,8 @@ def _levelled(views: list[Float64], border: Float64) -> list[Float64]:
         np.stack([points @ (H[k] - shift * H[2]) for H in views]) for k, shift in ((1, y0), (2, 0))
     )
     rows, depth = (each - each.mean(axis=1, keepdims=True) for each in (rows, depth))
+    # Rows stay aligned under (x, y) -> (x, y) / (1 + g·(y - y0)); this makes the third coordinates
+    # as even as possible along the borders of both images.
     g = -float((rows * depth).sum() / (rows * rows).sum())
     return [np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, g, 1.0 - g * y0]]) @ H for H in views]
 

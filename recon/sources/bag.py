@@ -308,7 +308,13 @@ def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadP
         expected = bag.list_topics(POSES) or "a file; the recording has no poses"
         raise SourceError(what, where=bag.paths[0], got=name, expected=expected)
     (parent, child), poses = _choose_frames(list(bag.poses(name)), where)
-    path = _path_of(poses, where, stamped=stamped)
+    stamps = [pose.stamp_ns if stamped else pose.recorded_ns for pose in poses]
+    times_ns, first = np.unique(stamps, return_index=True)
+    for pose in poses:
+        norm = float(np.linalg.norm(pose.xyzw))
+        if not (np.isfinite(pose.xyz_m).all() and np.isfinite(norm) and norm > 0):
+            raise FormatError("pose is not finite, or has no rotation", where=where)
+    path = Trajectory(np.stack([_transform(poses[index]) for index in first]), times_ns * NS)
     camera = bag.frame_id(image_topic)
     T_child_camera = _static_transform(bag, child, camera)
     origin = f"{name}, {counted(len(path), 'pose')} of {child or 'an unnamed frame'} in {parent}"
@@ -354,17 +360,6 @@ def _choose_frames(poses: list[BagPose], where: str) -> tuple[tuple[str, str], l
         expected, hint = "one, or one in the frame odom", "name a topic of odometry or poses"
         raise SourceError(what, where=where, got=got, expected=expected, hint=hint)
     return chosen[0], found[chosen[0]]
-
-
-def _path_of(poses: list[BagPose], where: str, *, stamped: bool) -> Trajectory:
-    stamps = [pose.stamp_ns if stamped else pose.recorded_ns for pose in poses]
-    times_ns, first = np.unique(stamps, return_index=True)
-    for pose in poses:
-        norm = float(np.linalg.norm(pose.xyzw))
-        if not (np.isfinite(pose.xyz_m).all() and np.isfinite(norm) and norm > 0):
-            raise FormatError("pose is not finite, or has no rotation", where=where)
-    transforms = [_transform(poses[index]) for index in first]
-    return Trajectory(np.stack(transforms), times_ns * NS)
 
 
 def _transform(pose: BagPose) -> Float64:

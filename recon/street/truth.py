@@ -129,10 +129,7 @@ def _footprint(
     shape: tuple[int, ...],
     resolution_m: float,
 ) -> OccupancyGrid:
-    """Return OCCUPIED where a surface lies in the height band, else FREE.
-
-    ``low`` is the first column and row. Objects taller than the band, such as houses, are hollow.
-    """
+    """Return OCCUPIED where a surface lies in the height band, else FREE."""
     rows, columns = shape
     origin = (float(low[0] * resolution_m), float(low[1] * resolution_m))
     vertices = se3.apply(T_map_street, world.soup.vertices.reshape(-1, 3)).reshape(-1, 3, 3)

@@ -14,11 +14,10 @@ import warnings
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -339,8 +338,7 @@ def _silent_pillow() -> Iterator[None]:
         yield
 
 
-@dataclass(frozen=True)
-class ExifFocal:
+class ExifFocal(NamedTuple):
     """A focal length in pixels of the image, and what the camera recorded for it."""
 
     focal_px: float
@@ -352,28 +350,22 @@ def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal
     try:
         with _silent_pillow(), reading(path), Image.open(path) as image:
             tags: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_IFD)
-            return _by_sensor(tags, width_px) or _by_35mm(tags, width_px, height_px)
+            unit_mm = _MM_PER_UNIT.get(tags.get(_SENSOR_UNIT, 2))
+            focal_mm, equivalent_mm, resolution, recorded_px = (
+                _number(tags.get(name))
+                for name in (
+                    _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _SENSOR_RESOLUTION, _SENSOR_WIDTH_PX
+                )
+            )  # fmt: skip
     except FormatError:
         return None
-
-
-def _by_sensor(tags: Mapping[int, Any], width_px: int) -> ExifFocal | None:
-    focal_mm = _number(tags.get(_FOCAL_LENGTH))
-    resolution = _number(tags.get(_SENSOR_RESOLUTION))
-    unit_mm = _MM_PER_UNIT.get(tags.get(_SENSOR_UNIT, 2))
-    recorded_px = _number(tags.get(_SENSOR_WIDTH_PX))
-    if focal_mm is None or resolution is None or unit_mm is None or recorded_px is None:
-        return None
-    focal_px = focal_mm * resolution / unit_mm * width_px / recorded_px
-    return ExifFocal(focal_px, f"{focal_mm:g} mm and the pixels of the sensor")
-
-
-def _by_35mm(tags: Mapping[int, Any], width_px: int, height_px: int) -> ExifFocal | None:
-    equivalent_mm = _number(tags.get(_FOCAL_LENGTH_35MM))
-    if equivalent_mm is None:
-        return None
-    focal_px = equivalent_mm * math.hypot(width_px, height_px) / _DIAGONAL_35MM
-    return ExifFocal(focal_px, f"{equivalent_mm:g} mm as 35 mm equivalent")
+    if focal_mm and resolution and unit_mm and recorded_px:
+        focal_px = focal_mm * resolution / unit_mm * width_px / recorded_px
+        return ExifFocal(focal_px, f"{focal_mm:g} mm and the pixels of the sensor")
+    if equivalent_mm:
+        focal_px = equivalent_mm * math.hypot(width_px, height_px) / _DIAGONAL_35MM
+        return ExifFocal(focal_px, f"{equivalent_mm:g} mm as 35 mm equivalent")
+    return None
 
 
 def _number(value: Any) -> float | None:

@@ -130,24 +130,24 @@ def write_pcd(path: StrPath, clouds: Iterable[PointCloud]) -> int:
 
     Ref: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, version 0.7.
     """
-    return write_row_stream(path, tables_of(clouds, "pcd"), _pcd_header)
 
+    def header(rows: int, filler: str, dtype: np.dtype[Any]) -> bytes:
+        names = dtype.names or ()
+        each = [dtype[name] for name in names]
+        lines = [
+            "# .PCD v0.7 - Point Cloud Data file format",
+            f"# {filler}{filler}",  # the number of rows is named twice
+            "VERSION 0.7",
+            f"FIELDS {' '.join(names)}",
+            f"SIZE {' '.join(str(one.itemsize) for one in each)}",
+            f"TYPE {' '.join(one.kind.upper() for one in each)}",
+            f"COUNT {' '.join('1' for _ in each)}",
+            *(f"WIDTH {rows}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {rows}"),
+            *("DATA binary", ""),
+        ]
+        return "\n".join(lines).encode()
 
-def _pcd_header(rows: int, filler: str, dtype: np.dtype[Any]) -> bytes:
-    names = dtype.names or ()
-    each = [dtype[name] for name in names]
-    lines = [
-        "# .PCD v0.7 - Point Cloud Data file format",
-        f"# {filler}{filler}",  # the number of rows is named twice
-        "VERSION 0.7",
-        f"FIELDS {' '.join(names)}",
-        f"SIZE {' '.join(str(one.itemsize) for one in each)}",
-        f"TYPE {' '.join(one.kind.upper() for one in each)}",
-        f"COUNT {' '.join('1' for _ in each)}",
-        *(f"WIDTH {rows}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {rows}"),
-        *("DATA binary", ""),
-    ]
-    return "\n".join(lines).encode()
+    return write_row_stream(path, tables_of(clouds, "pcd"), header)
 
 
 Arrays = Mapping[str, NDArray[Any]]

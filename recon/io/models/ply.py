@@ -136,7 +136,14 @@ def read_tables(path: StrPath, wanted: Sequence[str]) -> tuple[PlyHeader, dict[s
         for name, count, dtype in header.elements:
             if not missing:
                 break
-            tables[name] = _read_element(stream, header.encoding, name, count, dtype)
+            read = _read_text if header.encoding == "ascii" else _read_binary
+            table = tables[name] = read(stream, count, dtype)
+            for field_name, field in _fields(dtype):
+                if field.shape and (table[field_name + LIST_LENGTH] != 3).any():
+                    raise FormatError("a face is not a triangle", hint="triangulate the mesh first")
+            if len(table) < count:
+                what = f"the file is truncated in its element {name!r}"
+                raise FormatError(what, got=counted(len(table), "row"), expected=f"{count}")
             missing.discard(name)
         return header, {name: table for name, table in tables.items() if name in wanted}
 
@@ -179,19 +186,14 @@ def _header(
 ) -> bytes:
     lines = ["ply", f"format {encoding} 1.0", *(f"comment {comment}" for comment in comments)]
     for name, rows, dtype in elements:
-        lines += [f"element {name} {rows}", *_property_lines(dtype)]
+        lines.append(f"element {name} {rows}")
+        for each, field in _fields(dtype):
+            code = _NAMES[field.base.str[1:]]
+            if field.shape:
+                lines.append(f"property list uchar {code} {each}")
+            elif not each.endswith(LIST_LENGTH):
+                lines.append(f"property {code} {each}")
     return "\n".join([*lines, "end_header", ""]).encode()
-
-
-def _property_lines(dtype: np.dtype[Any]) -> list[str]:
-    lines = []
-    for name, field in _fields(dtype):
-        code = _NAMES[field.base.str[1:]]
-        if field.shape:
-            lines.append(f"property list uchar {code} {name}")
-        elif not name.endswith(LIST_LENGTH):
-            lines.append(f"property {code} {name}")
-    return lines
 
 
 def _fields(dtype: np.dtype[Any]) -> list[tuple[str, np.dtype[Any]]]:
@@ -224,8 +226,12 @@ def _read_header(stream: IO[bytes]) -> PlyHeader:
                 comments.append(line.partition(" ")[2])
             case ["element", name, count] if count.isdigit():
                 elements.append((name, int(count), []))
-            case ["property", *words] if elements and _is_property(words):
-                elements[-1][2].extend(_property_fields(words, _ORDERS.get(encoding, "<")))
+            case ["property", "list", kind, of, name] if elements and {kind, of} <= _TYPES.keys():
+                order = _ORDERS.get(encoding, "<")
+                length = (name + LIST_LENGTH, order + _TYPES[kind])
+                elements[-1][2].extend([length, (name, order + _TYPES[of], (3,))])
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1][2].append((name, _ORDERS.get(encoding, "<") + _TYPES[kind]))
             case _:
                 raise FormatError("cannot read the PLY header", got=repr(line[:60]))
     else:
@@ -237,34 +243,6 @@ def _read_header(stream: IO[bytes]) -> PlyHeader:
     except ValueError as error:
         raise FormatError("the PLY header names a property twice") from error
     return PlyHeader(encoding, typed, tuple(comments))
-
-
-def _is_property(words: list[str]) -> bool:
-    is_list = words[:1] == ["list"]
-    types = words[is_list:-1]
-    return len(types) == 1 + is_list and set(types) <= _TYPES.keys()
-
-
-def _property_fields(words: list[str], order: str) -> list[tuple[Any, ...]]:
-    name = words[-1]
-    if words[0] == "list":
-        length, entry = (order + _TYPES[word] for word in words[1:-1])
-        return [(name + LIST_LENGTH, length), (name, entry, (3,))]
-    return [(name, order + _TYPES[words[0]])]
-
-
-def _read_element(
-    stream: IO[bytes], encoding: str, name: str, count: int, dtype: np.dtype[Any]
-) -> Table:
-    read = _read_text if encoding == "ascii" else _read_binary
-    table = read(stream, count, dtype)
-    for field_name, field in _fields(dtype):
-        if field.shape and (table[field_name + LIST_LENGTH] != 3).any():
-            raise FormatError("a face is not a triangle", hint="triangulate the mesh first")
-    if len(table) < count:
-        what, got = f"the file is truncated in its element {name!r}", counted(len(table), "row")
-        raise FormatError(what, got=got, expected=f"{count}")
-    return table
 
 
 def _read_binary(stream: IO[bytes], count: int, dtype: np.dtype[Any]) -> Table:

@@ -150,10 +150,7 @@ def _gather(views: Sequence[View]) -> list[_Corners]:
 
 
 def _linearise(corners: Sequence[_Corners], state: RigState) -> Float64:
-    """Return the normal equations JᵀJ of each view, float64 (V, P + 7, P + 7).
-
-    Columns of J: the shared parameters, the pose of the board, and the error itself.
-    """
+    """Return JᵀJ of each view, (V, P + 7, P + 7): shared parameters, pose of the board, error."""
     size, at = len(_prior(state)[0]), 0
     normals = np.zeros((len(state.T_rig_board), size + _POSE + 1, size + _POSE + 1))
     for camera, T, seen in zip(state.cameras, state.T_camera_rig, corners, strict=True):

@@ -159,7 +159,17 @@ def check_chessboard(
         larger = any(n > m for n, m in zip(size, claimed, strict=True))
         # If the given board was seen whole, a smaller one is part of it.
         if most >= enough and size != claimed and (larger or not seen[claimed]):
-            raise _wrong_size(size, f"{most} of {counted(voters, 'image')}", board)
+            # A board may be held upright or sideways.
+            columns, rows = size if board.columns <= board.rows else size[::-1]
+            given = f"{board.columns}x{board.rows}"
+            squares = (columns + 1, rows + 1) == (board.columns, board.rows)
+            why = "count inner corners, not squares" if squares else "count the inner corners again"
+            raise CalibrationError(
+                f"the board in the images does not have {given} inner corners",
+                got=f"{columns}x{rows} in {most} of {counted(voters, 'image')}",
+                expected=given,
+                hint=f"{why}, or give --board chess:{columns}x{rows}:…",
+            )
 
 
 def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBoard) -> None:
@@ -258,13 +268,11 @@ def _continue(grey: UInt8, grid: Float64, axis: int, usual: float) -> Float64 | 
 
 
 def _contrast(grey: UInt8, grid: Float64) -> Float64:
-    """Return float64 (R, C), how the diagonal pairs of quadrants of each corner differ.
-
-    Differences within a pair count against it. NaN where a quadrant is outside the image.
-    """
+    """Return float64 (R, C), how diagonal quadrants of each corner differ; NaN = outside."""
     down, across = np.gradient(grid, axis=(0, 1))
     smooth, signs = cv2.blur(grey, (3, 3)), ((1, 1), (-1, -1), (1, -1), (-1, 1))
     a, b, c, d = (_sample(smooth, grid + 0.4 * (p * across + q * down)) for p, q in signs)
+    # Differences within a pair count against it.
     return np.asarray(np.abs(a + b - c - d) - np.abs(a - b) - np.abs(c - d)) / 2
 
 
@@ -274,19 +282,6 @@ def _sample(grey: UInt8, places: Float64) -> Float64:
     inside = ((at >= 0) & (at < (width, height))).all(axis=-1)
     x, y = np.where(inside, at[..., 0], 0), np.where(inside, at[..., 1], 0)
     return np.where(inside, grey[y, x].astype(np.float64), np.nan)
-
-
-def _wrong_size(size: Inner, where: str, board: CalibrationBoard) -> CalibrationError:
-    columns, rows = size if board.columns <= board.rows else size[::-1]
-    claimed = f"{board.columns}x{board.rows}"
-    squares = (columns + 1, rows + 1) == (board.columns, board.rows)
-    why = "count inner corners, not squares" if squares else "count the inner corners again"
-    return CalibrationError(
-        f"the board in the images does not have {claimed} inner corners",
-        got=f"{columns}x{rows} in {where}",
-        expected=claimed,
-        hint=f"{why}, or give --board chess:{columns}x{rows}:…",
-    )
 
 
 def dark_rectangles(board: CalibrationBoard) -> Float64:

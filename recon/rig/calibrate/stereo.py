@@ -122,10 +122,8 @@ def stereo_of(state: RigState) -> StereoCalibration:
 
 
 def _group_views(views: Sequence[View]) -> list[list[View]]:
-    """Group the views by pose of the board, the view that represents a group first.
-
-    Errors on a still board are mostly the same in every image: repeated views measure nothing new.
-    """
+    """Group the views by pose of the board, the view that represents a group first."""
+    # Errors on a still board are mostly the same in every image: repeats measure nothing new.
     groups: list[list[View]] = []
     for view in views:
         same = next((group for group in groups if _moved(group[0], view) < _STILL), None)
@@ -353,10 +351,7 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
 
 
 def _working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
-    """Return the distance at which depth matters: by default, where matching errs by 2 %.
-
-    Errors of calibration grow with its square as well: the comparison of both is the same anywhere.
-    """
+    """Return the distance at which depth matters: by default, where matching errs by 2 %."""
     usual_m = _MATCHED * float(rig.left.matrix[0, 0]) * rig.baseline_m / MATCH_SIGMA_PX
     return usual_m if settings.working_m is None else settings.working_m
 
