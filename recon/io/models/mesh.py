@@ -1,4 +1,4 @@
-"""Meshes as PLY, OBJ, STL and GLB files, and projects of MeshLab (.mlp) that open several layers."""
+"""Meshes as PLY, OBJ, STL and GLB files, and MeshLab projects (.mlp) of several layers."""
 
 from __future__ import annotations
 
