@@ -102,18 +102,6 @@ def _heights_m(xyz: Float32, path: Trajectory) -> Float64:
     return np.asarray(-np.einsum("ni,ni->n", down, xyz - path.positions_m[nearest]))
 
 
-def register_cloud(
-    cloud: PointCloud, reference: PointCloud, reach_m: float
-) -> tuple[Float64, float]:
-    """Align a cloud to a reference by `icp`; only the errors of its shape are left.
-
-    The cloud may be off by less than ten times ``reach_m``, the distance of partners at the end.
-    """
-    _check(cloud, reference, reach_m)
-    xyz, reference_xyz = (_thinned(one, reach_m / 2) for one in (cloud, reference))
-    return icp(xyz, reference_xyz, (10 * reach_m, 3 * reach_m, reach_m))
-
-
 def nearest_distances(xyz: Float32, reference_xyz: Float32) -> Float32:
     """Return float32 (N,), the distance of each point to the nearest of the reference, metres."""
     return open3d_clouds.nearest(xyz, reference_xyz)[1][:, 0]
@@ -287,7 +275,10 @@ def place_by_icp(
         placed, how = place_cloud(mapped, frame, align_to)
         cloud, axes = placed.cloud, placed.cloud.frame
         try:
-            T, share = register_cloud(cloud, replace(reference, frame=axes), reach_m)
+            _check(cloud, replace(reference, frame=axes), reach_m)
+            xyz, reference_xyz = (_thinned(one, reach_m / 2) for one in (cloud, reference))
+            # Only the errors of its shape are left.
+            T, share = icp(xyz, reference_xyz, (10 * reach_m, 3 * reach_m, reach_m))
         except RegistrationError:
             if frame == frames[-1] and not found:
                 raise

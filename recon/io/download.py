@@ -42,10 +42,7 @@ class _BrokenOffError(Exception):
 def download(
     address: str, path: Path, size: int | None = None, on_bytes: OnBytes = lambda *_: None
 ) -> None:
-    """Download a file of that size, if it is known, or the rest of one that an earlier call began.
-
-    A connection that breaks off is opened again, up to five times in a row without a byte.
-    """
+    """Download a file, or the rest of one that an earlier call began; reopen what breaks off."""
     part, tries = path.with_name(path.name + ".part"), 0
     while True:
         before = _size(part)

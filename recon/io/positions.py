@@ -122,10 +122,7 @@ def read_positions(path: StrPath) -> Positions:
 
 
 def in_order(found: Positions, path: StrPath) -> Positions:
-    """Return positions in the order of time, without those that say that there is none.
-
-    One that is no place on earth is refused, and a file without any.
-    """
+    """Return positions in the order of time; those without a place are left out."""
     good = np.isfinite(found.places).all(axis=1) & np.isfinite(found.times_s)
     if found.degrees:
         good &= np.abs(found.places[:, :2]).max(axis=1, initial=0.0) > _NO_PLACE_DEG

@@ -83,10 +83,7 @@ class CapturedPair:
 
 @contextmanager
 def open_cameras(devices: Iterable[str], settings: CaptureSettings) -> Iterator[tuple[Camera, ...]]:
-    """Open the left and the right camera, or one with both views, for the body of a ``with``.
-
-    ``devices`` are numbers, paths, addresses of streams, or video files.
-    """
+    """Open a left and a right camera, or one with both views, by number, path or address."""
     width, height = settings.width_px, settings.height_px
     size = None if width is None or height is None else (width, height)
     with ExitStack() as stack:
@@ -120,10 +117,7 @@ def capture_pairs(
 
 
 def warm_up(cameras: tuple[Camera, ...], settings: CaptureSettings) -> bool:
-    """Drop the first frames, lock the exposure of the left camera on both, return whether it is.
-
-    Video files keep all frames.
-    """
+    """Drop the first frames of live cameras; return whether the exposure of all is locked."""
     if not all(camera.live for camera in cameras):
         return False
     for _ in range(_WARM_UP_FRAMES):
@@ -287,10 +281,7 @@ def write_pairs(
 
 
 class CameraSource(StereoSource):
-    """The pairs that cameras take from now on; live if none of them is a video file.
-
-    ``files`` are what the calibration was read from; ``stopped`` is asked before each pair.
-    """
+    """The pairs that cameras take from now on; live if none of them is a video file."""
 
     name: str
     calibration: Rig

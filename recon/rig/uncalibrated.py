@@ -70,13 +70,10 @@ class UncalibratedRectification:
 def rectify_images(
     pairs: Sequence[tuple[UInt8, UInt8]], count: int = MOST_FEATURES
 ) -> UncalibratedRectification:
-    """Find the simplest change that aligns the rows of grey pairs of one uncalibrated rig.
-
-    ``count`` limits the features of an image; homographies are refined by a second matching.
-    """
+    """Find the simplest change that aligns the rows of grey pairs of one uncalibrated rig."""
     height, width = pairs[0][0].shape
     matched = [match_exactly(left, right, count) for left, right in pairs]
-    # The initial guess may rest on few matches: the second round checks it.
+    # The initial guess may rest on few matches: homographies are refined by a second round.
     found = rectify_features(matched, (width, height), _FEWEST_AT_FIRST)
     if found.model != "homographies":
         return found

@@ -51,10 +51,7 @@ _RAW_CALIBRATION: Final = "calib_cam_to_cam.txt"
 
 
 def open_kitti(folder: Path, settings: SourceSettings | None = None) -> ImageSource:
-    """Open a drive of the odometry benchmark, the grey images if it has both kinds.
-
-    Where images were deleted, lines of times.txt and poses.txt are found by numbers in the names.
-    """
+    """Open a drive of the odometry benchmark, the grey images if it has both kinds."""
     if not folder.is_dir():
         raise SourceError("folder does not exist", where=folder)
     pair = _choose_cameras(folder, "image_{}")
@@ -63,6 +60,7 @@ def open_kitti(folder: Path, settings: SourceSettings | None = None) -> ImageSou
     left, right = ({path.name: path for path in list_images(view)} for view in views)
     names = sorted(left.keys() | right.keys(), key=natural_key)
     frames = [(left.get(name), right.get(name)) for name in names]
+    # Where images were deleted, lines of times.txt and poses.txt are found by numbers in the names.
     images, listing = pair_named(frames, settings, folder)
     times, time_files = _read_times(folder, listing, settings)
     rig, calibration_files = _read_rig([folder / "calib.txt"], settings, pair, images[0][0])

@@ -73,10 +73,7 @@ class DepthSource(ImageSource):
 
 
 def disparity_of(levels: NDArray[Any], per_metre: float, camera: RectifiedCamera) -> Disparity:
-    """Return the disparity of an image of depth: uint16 (H, W), 0 = unknown.
-
-    It varies as a Kinect's does, and as its depth was rounded.
-    """
+    """Return the disparity of uint16 (H, W), 0 = unknown, as sure as that of a Kinect."""
     values = disparity_from_depth(levels / per_metre, camera)
     step_px = (values + np.float32(camera.doffs_px)) / np.maximum(levels, 1)
     return Disparity.from_values(values, sigma_px=np.hypot(_KINECT_PX, _ROUNDED * step_px))

@@ -136,10 +136,7 @@ class StereoSource(ABC):
         return ReadPrior(read_tum(name), name)
 
     def read_imu(self) -> ImuRecord | None:
-        """Read what the inertial unit of the rig measured; None = the source has none.
-
-        One whose file cannot be used is a `ReconError`.
-        """
+        """Read the inertial unit of the rig; None = there is none, `ReconError`: it is damaged."""
         return None
 
     def occupancy_truth(
@@ -345,10 +342,7 @@ def pair_frames(
     where: Path,
     names: Sequence[str] | None = None,
 ) -> tuple[list[tuple[Left, Right]], FrameList]:
-    """Return the pairs that are used, of frames in order with a left and right image (or None).
-
-    ``names`` are those of the frames without suffix.
-    """
+    """Return the pairs that are used of frames with a left and right image, None = missing."""
     alone_right = sum(left is None and right is not None for left, right in frames)
     # A listed frame without any image counts as one, on the left.
     alone_left = sum(right is None for _, right in frames)

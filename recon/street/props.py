@@ -323,10 +323,7 @@ def _openings(plan: HousePlan, rng: np.random.Generator) -> tuple[Float64, Float
 
 
 def wall_with_holes(width_m: float, height_m: float, holes: Float64, paint: Paint) -> TriangleSoup:
-    """Return a wall in the plane y = 0 with rectangular holes (N, 4), each (x0, z0, x1, z1).
-
-    It is split along the edges of all holes.
-    """
+    """Return a wall in the plane y = 0 with rectangular holes (N, 4), each (x0, z0, x1, z1)."""
     xs = np.unique(np.concatenate([[0.0, width_m], holes[:, 0], holes[:, 2]]))
     zs = np.unique(np.concatenate([[0.0, height_m], holes[:, 1], holes[:, 3]]))
     x_mid, z_mid = 0.5 * (xs[:-1] + xs[1:]), 0.5 * (zs[:-1] + zs[1:])

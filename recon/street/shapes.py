@@ -46,10 +46,7 @@ def boxes(low: Any, high: Any, paint: Paint) -> TriangleSoup:
 
 
 def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint) -> TriangleSoup:
-    """Return the four walls of a box that narrows towards the top.
-
-    ``inset`` is that of the top at the back (-x), at the front (+x) and at each side.
-    """
+    """Return the walls of a box whose top is narrower by ``inset``: at -x, +x and each side."""
     (x0, y0, z0), (x1, y1, z1), (back, front, side) = low, high, inset
 
     def rim(x0: float, x1: float, y0: float, y1: float, z: float) -> Float64:
@@ -210,10 +207,7 @@ def at(x: float, y: float, z: float, turn_rad: float = 0.0) -> Float64:
 def painted(
     vertices: Float64, uv: Float64, paint: Paint, normals: Float64 | None = None
 ) -> TriangleSoup:
-    """Return triangles (F, 3, 3) with texture coordinates (F, 3, 2), all in one paint.
-
-    Without ``normals`` they are flat-shaded.
-    """
+    """Return triangles (F, 3, 3) in one paint, flat-shaded unless there are ``normals``."""
     n = len(vertices)
     if normals is None:
         flat = np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0])

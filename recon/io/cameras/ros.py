@@ -68,10 +68,7 @@ def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
 
 @reader
 def read_camera_info(path: StrPath, size: tuple[int, int] | None = None) -> StereoCalibration:
-    """Read a rig from either of its two files; its pose follows from ``R`` and ``P`` of both.
-
-    ``size`` is width and height of the images; rectified ones that ``K`` is not of are refused.
-    """
+    """Read a rig from either of its two files; its pose follows from ``R`` and ``P`` of both."""
     left_path, right_path = camera_info_paths(path)
     if not (left_path.is_file() and right_path.is_file()):
         missing = right_path if left_path.is_file() else left_path
@@ -79,6 +76,7 @@ def read_camera_info(path: StrPath, size: tuple[int, int] | None = None) -> Ster
         raise FormatError("CameraInfo of the other camera is missing", where=missing, hint=hint)
     (left, R_left, P_left), (right, R_right, P_right) = map(_read_one, (left_path, right_path))
     projections = P_left, P_right
+    # The images may be rectified, and K be of others.
     stated = left.width_px, left.height_px
     if size and are_rectified((left.matrix, right.matrix), projections, stated, size):
         focal, cx, cy = P_left[[0, 0, 1], [0, 2, 2]]

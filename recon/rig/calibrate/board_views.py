@@ -132,10 +132,7 @@ def is_video(where: str) -> bool:
 def pick_views(
     files: Sequence[Path], settings: SourceSettings, path: Callable[[str], Path]
 ) -> ImagePairs:
-    """Write the still frames that differ most as image files, to the ``path`` of their names.
-
-    ``files`` are a left and a right video, or one with both views.
-    """
+    """Write the still frames that differ most, of two videos or one with both views."""
     videos = open_videos(files)
     every = max(1, round(videos[0].rate_hz / _LOOKS_HZ))
     looks = range(0, min(video.frames for video in videos), every)

@@ -50,14 +50,11 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class RigState:
-    """Everything that is estimated: one or two cameras, the first at the origin of the rig.
-
-    Transforms are float64: (4, 4) of each camera, (V, 4, 4) of the board in each view.
-    """
+    """Everything that is estimated: one or two cameras, the first at the origin of the rig."""
 
     cameras: tuple[CameraIntrinsics, ...]
-    T_camera_rig: tuple[Float64, ...]
-    T_rig_board: Float64
+    T_camera_rig: tuple[Float64, ...]  # (4, 4) of each camera
+    T_rig_board: Float64  # (V, 4, 4), of the board in each view
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,10 +106,7 @@ def solve(
 
 
 def squared_errors(views: Sequence[View], state: RigState) -> tuple[Float64, Float64]:
-    """Return sums of squared pixel errors, and numbers of corners: float64 (V, cameras) each.
-
-    A sum is NaN where a corner is behind the camera.
-    """
+    """Return sums of squared errors, px² (NaN = behind), and numbers of corners: (V, cameras)."""
     corners = _gather(views)
     squares = zip(corners, _squares(corners, state), strict=True)
     sums = [np.bincount(seen.view, each, len(views)) for seen, each in squares]

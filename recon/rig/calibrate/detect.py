@@ -39,10 +39,7 @@ _PREFIX: Final = "DICT_"
 
 
 def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
-    """Find the corners of a board in a grey image; None if fewer than 8, or all on one line.
-
-    A chessboard must be fully visible, a ChArUco board may be partly visible.
-    """
+    """Find the corners of a board, or a part of ChArUco; None if fewer than 8, or on one line."""
     if board.kind == "charuco":
         corners, found_numbers, *_ = cv2.aruco.CharucoDetector(_charuco(board)).detectBoard(grey)
         if found_numbers is None:
@@ -204,10 +201,7 @@ def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBo
 
 
 def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
-    """Return columns and rows of a grid of inner corners, extended as far as corners are found.
-
-    ``inner`` is the size of the grid ``pixels`` (N, 2), which goes row by row.
-    """
+    """Return columns and rows of a grid of corners (N, 2), extended as far as there are corners."""
     columns, rows = inner
     grid = pixels.reshape(rows, columns, 2)
     usual = float(np.nanmedian(_contrast(grey, grid)))
@@ -285,10 +279,7 @@ def _sample(grey: UInt8, places: Float64) -> Float64:
 
 
 def dark_rectangles(board: CalibrationBoard) -> Float64:
-    """Return float64 (M, 4), the dark rectangles of a board: x0, y0, x1, y1 in metres.
-
-    The origin is the first inner corner, as in `CalibrationBoard.corners_m`.
-    """
+    """Return float64 (M, 4), dark rectangles: x0, y0, x1, y1, metres from the first corner."""
     columns, rows = board.squares
     # OpenCV's boards have a dark square at the upper left corner, legacy ones at the lower left.
     light = 1 if board.kind == "charuco" and board.legacy and rows % 2 == 0 else 0

@@ -69,8 +69,6 @@ class StereoFit:
 def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSettings) -> StereoFit:
     """Calibrate two cameras: each alone, then all parameters of both together.
 
-    Of views that repeat each other one is used; views that do not fit are dropped.
-
     Ref: Zhang 2000; the lens models are OpenCV's.
     """
     groups = _group_views(views)
