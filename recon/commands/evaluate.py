@@ -53,9 +53,9 @@ from recon.io.atomic import check_targets
 from recon.io.files import naming
 from recon.io.images.disparity import read_disparity, read_pfm
 from recon.io.images.image import read_grey_levels, write_image
-from recon.io.models.nav2 import read_grid
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
+from recon.io.models.rasters import read_grid
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
 from recon.report.map_page import write_map_errors, write_trajectory_page
 from recon.report.style import colour_grid_errors

@@ -17,7 +17,7 @@ from recon.core.values import Recorded
 from recon.export.trajectories import begin_states, export_localized, write_states
 from recon.io.fields import write_json
 from recon.io.files import StrPath
-from recon.io.models.nav2 import read_grid
+from recon.io.models.rasters import read_grid
 from recon.look.look import look_at
 from recon.map.drive.drive import Workspace
 from recon.map.drive.scale import measure_scene

@@ -21,9 +21,9 @@ from recon.io.images.disparity import read_pfm
 from recon.io.images.image import read_image
 from recon.io.middlebury import read_middlebury_calib
 from recon.io.models.mesh import read_mesh
-from recon.io.models.nav2 import read_grid, write_nav2
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
+from recon.io.models.rasters import read_grid, write_nav2
 from recon.io.trajectory import read_frames, read_trajectory
 
 IDENTITY = b"1 0 0 0 0 1 0 0 0 0 1 0\n"

@@ -22,8 +22,8 @@ from recon.odometry.features import find_in_right
 from recon.odometry.sfm.find import check_sfm
 from recon.rig.audit import audit_source
 from recon.run.run import Run
+from recon.sources.listed import disparity_of
 from recon.sources.registry import open_source, recognise_source
-from recon.sources.rgbd import disparity_of
 from recon.sources.settings import SourceSettings
 from recon.sources.source import DerivedSource
 from recon.stereo.frame import FrameReconstructor

@@ -17,7 +17,6 @@ from recon.core.text import counted
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.board import CalibrationBoard
 from recon.io.images.image import read_image, write_image
-from recon.io.images.video import VIDEOS, VideoFile
 from recon.rig.calibrate.bundle import Sighting, View
 from recon.rig.calibrate.detect import (
     check_charuco,
@@ -28,7 +27,7 @@ from recon.rig.calibrate.detect import (
 )
 from recon.sources.images import ImagePairs
 from recon.sources.settings import SourceSettings
-from recon.sources.video import open_videos, split_views, view_size
+from recon.sources.video import VIDEOS, VideoFile, open_videos, split_views, view_size
 from recon.stereo.rectify.rectifier import to_grey
 
 _LOOKS_HZ: Final = 10.0  # looks at a video per second: a hand holds a board still for longer
