@@ -230,9 +230,8 @@ def encode_branch(keys: Int32, log_odds: Float32, depth: int) -> Branch:
         for axis in range(3):
             code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     order = np.argsort(code)
-    levels = [code[order] >> (3 * up) for up in range(depth + 1)]
     values, kinds = [log_odds[order]], [np.where(log_odds[order] >= 0, OCCUPIED, FREE)]
-    codes, begins = [levels[0]], []
+    codes, begins = [code[order]], []
     for _ in range(depth):
         parent = codes[-1] >> 3
         begin = np.flatnonzero(np.r_[True, parent[1:] != parent[:-1]])
