@@ -1,4 +1,4 @@
-"""Reads any supported calibration file, recognised by its content."""
+"""Calibration files: our own YAML, and those of other programs, recognised by their content."""
 
 from __future__ import annotations
 
