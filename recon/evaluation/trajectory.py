@@ -208,10 +208,7 @@ def _check_orders(
     share = off(estimate, truth)
     if share < _NONSENSE:
         return
-    others = {
-        "estimate": off(reordered(estimate), truth),
-        "truth": off(estimate, reordered(truth)),
-    }
+    others = {"estimate": off(reordered(estimate), truth), "truth": off(estimate, reordered(truth))}
     name, least = min(others.items(), key=lambda item: item[1])
     if least < 0.1 * share:
         what = f"the quaternions of the {name} are not in the order of TUM, qx qy qz qw"

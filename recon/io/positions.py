@@ -17,14 +17,7 @@ import numpy as np
 from recon.core.errors import EvaluationError, FormatError, require
 from recon.core.text import counted, parse_numbers
 from recon.core.values.arrays import Float64
-from recon.io.files import (
-    StrPath,
-    read_lines,
-    read_table,
-    read_text,
-    reader,
-    seconds_of_date,
-)
+from recon.io.files import StrPath, read_lines, read_table, read_text, reader, seconds_of_date
 from recon.io.models.las import check_crs
 from recon.io.trajectory import check_positions
 

@@ -15,14 +15,7 @@ from numpy.typing import NDArray
 from recon.core.errors import CalibrationError, FormatError, SourceError
 from recon.core.geometry.se3 import invert, make_transform, rotation_from_quaternion
 from recon.core.text import counted
-from recon.core.values import (
-    CameraIntrinsics,
-    ImuRecord,
-    Rig,
-    StereoPair,
-    Trajectory,
-    check_size,
-)
+from recon.core.values import CameraIntrinsics, ImuRecord, Rig, StereoPair, Trajectory, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
 from recon.io.cameras.kitti import projected_rig

@@ -13,14 +13,7 @@ from typing import Any, Final, TypeVar
 
 from recon.core.errors import SourceError
 from recon.core.text import counted, is_count
-from recon.core.values import (
-    ImuRecord,
-    OccupancyTruth,
-    Recorded,
-    Rig,
-    SequenceTruth,
-    Trajectory,
-)
+from recon.core.values import ImuRecord, OccupancyTruth, Recorded, Rig, SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.files import fingerprint
 from recon.io.trajectory import read_tum

@@ -99,9 +99,7 @@ def with_first(clouds: Iterable[PointCloud]) -> tuple[PointCloud, Iterator[Point
 
 
 def write_row_stream(
-    path: StrPath,
-    tables: Iterator[Table],
-    header: Callable[[int, str, np.dtype[Any]], bytes],
+    path: StrPath, tables: Iterator[Table], header: Callable[[int, str, np.dtype[Any]], bytes]
 ) -> int:
     """Write rows that arrive in parts, behind a header that says how many, atomically.
 

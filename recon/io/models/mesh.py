@@ -25,12 +25,7 @@ from recon.io.atomic import atomic_path, write_bytes, write_text
 from recon.io.files import StrPath, reader, resolved
 from recon.io.images.image import encode_image, write_image
 from recon.io.models.columns import Table, attributes_in, columns_of, positions_in, table_of
-from recon.io.models.ply import (
-    LIST_LENGTH,
-    read_tables,
-    write_table_parts,
-    write_tables,
-)
+from recon.io.models.ply import LIST_LENGTH, read_tables, write_table_parts, write_tables
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
 _INDICES: Final = ("vertex_indices", "vertex_index")  # both names are in use
@@ -300,8 +295,7 @@ def decimate(
 def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
     """Return an Open3D mesh of copies; it accepts neither read-only nor float32 arrays."""
     return o3d.geometry.TriangleMesh(
-        _vectors(vertices),
-        o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32)),
+        _vectors(vertices), o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32))
     )
 
 
