@@ -70,26 +70,16 @@ _EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT", calibrated=True)
 
 @dataclass(frozen=True, eq=False)
 class MiddleburyScene:
-    """One scene with all data of its folder.
-
-    Attributes:
-        generation: Layout of the folder: "2005" includes 2006, and "2014" includes MiddEval3.
-        camera: None if none is published: 2001, 2003, and 2005 or 2006 without ``dmin.txt``.
-            Matching can then use a `stand_in_camera`.
-        truth: True disparity of the left image, or None if the folder has none.
-        ndisp: Number of disparities to search, or None if it is not published.
-        isint: True if results are rounded to whole pixels before comparison.
-        full_size_factor: Full-size pixels, in which the benchmark counts, per pixel of these.
-    """
+    """One scene with all data of its folder; its years are those of the layout."""
 
     name: str
-    generation: Generation
+    generation: Generation  # "2005" includes 2006, and "2014" includes MiddEval3
     pair: StereoPair
-    camera: RectifiedCamera | None
-    truth: DisparityTruth | None
-    ndisp: int | None
-    isint: bool
-    full_size_factor: float
+    camera: RectifiedCamera | None  # None = not published: 2001, 2003, or without ``dmin.txt``
+    truth: DisparityTruth | None  # of the left image
+    ndisp: int | None  # number of disparities to search; None = not published
+    isint: bool  # whether results are rounded to whole pixels before comparison
+    full_size_factor: float  # full-size pixels, in which the benchmark counts, per pixel of these
 
 
 @reader

@@ -229,8 +229,9 @@ _READERS: Final[dict[bytes, type[ImageFile]]] = {
     b"\x89PNG": PngImageFile, b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"P": PpmImageFile,
 }  # fmt: skip
 _TIFF_WIDTH, _TIFF_HEIGHT, _EXIF_IFD = 256, 257, 0x8769
-_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
-_SENSOR_RESOLUTION, _SENSOR_UNIT, _SENSOR_WIDTH_PX = 0xA20E, 0xA210, 0xA002
+_SENSOR_UNIT: Final = 0xA210
+#: Focal length, its 35 mm equivalent, pixels of the sensor per unit, width of the recorded image.
+_EXIF_NUMBERS: Final = (0x920A, 0xA405, 0xA20E, 0xA002)
 _MM_PER_UNIT: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _DIAGONAL_35MM: Final = math.hypot(36.0, 24.0)
 
@@ -352,11 +353,8 @@ def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal
             tags: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_IFD)
             unit_mm = _MM_PER_UNIT.get(tags.get(_SENSOR_UNIT, 2))
             focal_mm, equivalent_mm, resolution, recorded_px = (
-                _number(tags.get(name))
-                for name in (
-                    _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _SENSOR_RESOLUTION, _SENSOR_WIDTH_PX
-                )
-            )  # fmt: skip
+                _number(tags.get(name)) for name in _EXIF_NUMBERS
+            )
     except FormatError:
         return None
     if focal_mm and resolution and unit_mm and recorded_px:
