@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
 from recon.export.product import ExportContext, ExportResult
-from recon.io.models.npz import write_npz
-from recon.io.models.pcd import write_pcd
+from recon.io.models.columns import write_npz, write_pcd
 from recon.io.models.ply import write_ply_tiles
 from recon.map.tiles import Tiles
 

@@ -18,8 +18,8 @@ from recon.core.values import Disparity, RectifiedCamera, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import project, unproject
 from recon.export.images import DriveImages, open_images
-from recon.io.control_points import ControlPoints
 from recon.io.models.las import check_inside
+from recon.io.positions import ControlPoints
 from recon.map.map import Map
 from recon.map.sessions.georeference import Georeference, edge_m, georeference
 from recon.map.sessions.measured import LEVEL_RAD, Survey, fixed_turn, span_m

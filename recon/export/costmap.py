@@ -11,7 +11,7 @@ from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Int32
 from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext, ExportResult
-from recon.io.models.nav2 import write_nav2_costs
+from recon.io.models.rasters import write_nav2_costs
 from recon.map.ground.surface import GroundSurface
 from recon.map.ground.traverse import (
     UNSURE,

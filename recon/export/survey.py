@@ -12,9 +12,7 @@ from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool
 from recon.export.occupancy import GROUND_RATIO, grounds
 from recon.export.product import ExportContext, ExportResult
-from recon.io.models.copc import write_copc
-from recon.io.models.e57 import write_e57
-from recon.io.models.las import AreGround, write_las
+from recon.io.models.las import AreGround, write_copc, write_e57, write_las
 from recon.map.ground.surface import MAX_TILT_DEG, WINDOW_M, GroundSurface
 from recon.map.sessions.placed import PlacedMap
 

@@ -34,8 +34,7 @@ from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.voxels import reconstruct_map_surface
 from recon.export.product import ExportContext, ExportResult
-from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
-from recon.io.models.mlp import write_mlp
+from recon.io.models.mesh import join_meshes, read_mesh, write_mesh, write_mlp
 from recon.map.cut import Rectangle
 from recon.map.occupancy.moving import looked_through
 from recon.map.sessions.placed import has_occupancy

@@ -20,8 +20,7 @@ from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.views import BestViews, PosedImage, paint
 from recon.export.product import ExportContext, ExportResult
 from recon.io.images.image import write_image
-from recon.io.models.mesh import read_mesh, write_mesh
-from recon.io.models.mlp import Photo, write_mlp
+from recon.io.models.mesh import Photo, read_mesh, write_mesh, write_mlp
 from recon.map.fusion import fusion_range_m
 from recon.map.sessions.placed import settings_of
 
