@@ -28,8 +28,7 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Float32
-from recon.evaluation.map import evaluate_map, within_reach
-from recon.evaluation.map_comparison import place_cloud, read_mapped_cloud
+from recon.evaluation.map import evaluate_map, place_cloud, read_mapped_cloud, within_reach
 from recon.io.models.mesh import read_mesh
 from recon.io.models.ply import read_ply
 from recon.sources.registry import open_source

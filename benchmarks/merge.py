@@ -35,8 +35,8 @@ from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.evaluation.map import evaluate_map
 from recon.evaluation.trajectory import evaluate_trajectory
-from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply
+from recon.io.models.rasters import read_grid
 from recon.io.trajectory import read_trajectory
 from recon.map.map import Map
 from recon.map.sessions.joining import find_links

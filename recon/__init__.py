@@ -40,7 +40,7 @@ def __getattr__(name: str) -> Any:
 SHOWN_BY.update(
     plot=lambda value: import_module("recon.report.notebook").plot(value),
     html=lambda value: import_module("recon.report.notebook").html(value),
-    to_open3d=lambda value: import_module("recon.io.models.open3d_meshes").to_open3d(value),
+    to_open3d=lambda value: import_module("recon.io.models.mesh").to_open3d(value),
 )
 
 

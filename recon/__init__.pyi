@@ -50,9 +50,9 @@ from recon.io.middlebury import MiddleburyScene as MiddleburyScene
 from recon.io.middlebury import read_middlebury_scene as read_middlebury_scene
 from recon.io.models.mesh import read_mesh as read_mesh
 from recon.io.models.mesh import write_mesh as write_mesh
-from recon.io.models.nav2 import read_grid as read_grid
 from recon.io.models.ply import read_ply as read_ply
 from recon.io.models.ply import write_ply as write_ply
+from recon.io.models.rasters import read_grid as read_grid
 from recon.io.trajectory import read_trajectory as read_trajectory
 from recon.io.trajectory import write_trajectory as write_trajectory
 from recon.map.drive.sequence import MappedSequence as MappedSequence

@@ -78,7 +78,7 @@ def calibrate(
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board
         from recon.io.atomic import check_targets
-        from recon.rig.calibrate.result import describe_depths
+        from recon.rig.calibrate.verdict import describe_depths
         from recon.rig.written import form_of, targets_of
 
         if out is not None:

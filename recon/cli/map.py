@@ -275,7 +275,7 @@ def live(
     with shared.one_line_errors(), ExitStack() as stack:
         from recon.cli.progress import announce
         from recon.commands.localize import run_live
-        from recon.rig.cameras import is_camera, open_camera_source
+        from recon.rig.capture import is_camera, open_camera_source
 
         stopped = stack.enter_context(until_interrupted())
         pose, _ = read_start(start)

@@ -22,10 +22,14 @@ from recon.report.audit_page import write_audit_page
 from recon.report.calibration_page import write_calibration_page, write_epipolar_images
 from recon.rig.audit import Audit, audit_source, correct_calibration
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
-from recon.rig.calibrate.bootstrap import measure_spread
-from recon.rig.calibrate.result import CalibrationResult, describe_calibration, write_calibration
-from recon.rig.calibrate.stereo import calibrate_stereo
-from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
+from recon.rig.calibrate.stereo import calibrate_stereo, measure_spread
+from recon.rig.calibrate.verdict import (
+    CalibrationResult,
+    describe_calibration,
+    judge_calibration,
+    verdict_of_calibration,
+    write_calibration,
+)
 from recon.rig.capture import (
     CaptureFolder,
     RecordingSettings,
@@ -43,9 +47,9 @@ from recon.rig.rectification import (
 )
 from recon.rig.written import CalibrationForm, targets_of
 from recon.run.run import Run
-from recon.sources.image_names import ImagePairs, pair_images
+from recon.sources.images import ImagePairs, pair_images
+from recon.sources.live import Camera
 from recon.sources.one_pair import read_pair
-from recon.sources.opencv_camera import Camera
 from recon.sources.source import StereoSource
 from recon.stereo.match.registry import make_matcher
 

@@ -24,14 +24,14 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float32
 from recon.evaluation.disparity import evaluate_disparity
-from recon.evaluation.map import evaluate_map
-from recon.evaluation.map_comparison import (
+from recon.evaluation.map import (
     LEAST_FRAMES,
     MapComparison,
     ReferenceFrame,
     add_within_reach,
     doubt_axes,
     doubts_of_file,
+    evaluate_map,
     map_of_run,
     occupancy_view,
     place_by_icp,
@@ -53,9 +53,9 @@ from recon.io.atomic import check_targets
 from recon.io.files import naming
 from recon.io.images.disparity import read_disparity, read_pfm
 from recon.io.images.image import read_grey_levels, write_image
-from recon.io.models.nav2 import read_grid
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
+from recon.io.models.rasters import read_grid
 from recon.io.trajectory import holds_times, read_trajectory, write_tum
 from recon.report.map_page import write_map_errors, write_trajectory_page
 from recon.report.style import colour_grid_errors

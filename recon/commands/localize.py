@@ -17,7 +17,7 @@ from recon.core.values import Recorded
 from recon.export.trajectories import begin_states, export_localized, write_states
 from recon.io.fields import write_json
 from recon.io.files import StrPath
-from recon.io.models.nav2 import read_grid
+from recon.io.models.rasters import read_grid
 from recon.look.look import look_at
 from recon.map.drive.drive import Workspace
 from recon.map.drive.scale import measure_scene
@@ -26,7 +26,7 @@ from recon.map.localize.sequence import LocalizeResult, StartPose, localize_sequ
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
-from recon.rig.cameras import CameraSource
+from recon.rig.capture import CameraSource
 from recon.run.finished import GRID, STATES, figure_of, refuse_as_target
 from recon.run.run import SUMMARY
 from recon.sources.live import LiveSource

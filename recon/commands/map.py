@@ -29,11 +29,11 @@ from recon.core.values import (
     TrajectoryMetrics,
     TriangleMesh,
 )
-from recon.evaluation.map_comparison import DriveErrors, compare_with_truth
+from recon.evaluation.map import DriveErrors, compare_with_truth
 from recon.export.make import Products, make
 from recon.export.product import ExportContext
 from recon.export.trajectories import export_paths
-from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.cameras.calibration import write_recon_calibration
 from recon.look.findings import Finding, find_faults
 from recon.look.length import check_length, see_baseline
 from recon.look.look import Look, look_at

@@ -16,7 +16,7 @@ from recon.commands.config import ReconConfig
 from recon.commands.map_options import MapOptions
 from recon.core.errors import ClusterError, RegistrationError, SettingsError
 from recon.io.atomic import write_text
-from recon.io.cameras.recon_yaml import read_recon_calibration, write_recon_calibration
+from recon.io.cameras.calibration import read_recon_calibration, write_recon_calibration
 from recon.io.files import read_text, reading, resolved
 from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import odometry_of

@@ -18,7 +18,7 @@ from recon.evaluation.paper import (
 )
 from recon.io.images.disparity import write_pfm
 from recon.io.images.image import write_image
-from recon.io.models.mlp import write_mlp
+from recon.io.models.mesh import write_mlp
 from recon.io.models.ply import write_ply
 from recon.report.paper_page import write_paper_page
 from recon.report.style import colour_disparity

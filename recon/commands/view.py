@@ -11,8 +11,8 @@ from typing import Final
 
 from recon.core.text import with_unit
 from recon.io.files import read_text, reading
-from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply
+from recon.io.models.rasters import read_grid
 from recon.map.store.records import check_format, connect
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
 from recon.run.finished import CLOUD, GRID, command_of_map, figure_of, states_of

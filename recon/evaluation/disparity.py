@@ -39,19 +39,16 @@ def evaluate_disparity(
 ) -> DisparityMetrics:
     """Compare a disparity map with the truth, over the pixels whose truth is known.
 
-    ``bad[t]`` is the fraction of all compared pixels with an error above ``t``; pixels without a
-    value count as invalid and not as bad, so ``bad + invalid`` is the fraction of all failures.
+    ``bad[t]`` is the percentage of all compared pixels with an error above ``t``; pixels without a
+    value count as invalid and not as bad, so ``bad + invalid`` are all failures.
 
     Args:
         estimate: A disparity, or its values: (H, W), pixels, not finite = none.
-        truth: Ground truth at the same size, or its values as `DisparityTruth.from_values` takes
-            them.
+        truth: Ground truth of that size, or its values (`DisparityTruth.from_values`).
         thresholds_px: Thresholds of ``bad``, in pixels at the scale of the results.
         occluded: Whether to include pixels that only the left camera sees.
-        scale: Factor from pixels of the map to pixels of the results: 4 reports a quarter-size
-            map in full-size pixels.
-        kind: Compare pixels of one kind alone, of which none is invalid: "measured" or "inferred".
-            Values that come without their kinds are measured.
+        scale: Pixels of the results per pixel of the map, such as 4 for quarter-size maps.
+        kind: Compare pixels of one kind alone, of which none is invalid.
 
     Raises:
         EvaluationError: The sizes differ, there is no such kind, or no pixel has a known truth.
@@ -92,10 +89,9 @@ def evaluate_depth(
     *,
     occluded: bool = False,
 ) -> DepthMetrics:
-    """Compare the depth of a disparity map with the true depth.
+    """Compare the depth of a disparity map with the true depth, by a camera of their size.
 
-    Estimate, truth, ``occluded`` and errors are those of `evaluate_disparity`; the camera is that
-    of images of their size.
+    The other arguments and errors are those of `evaluate_disparity`.
     """
     values, true = _compared(estimate, truth, occluded=occluded)
     true_m = depth_from_disparity(true, camera).astype(np.float64)

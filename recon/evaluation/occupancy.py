@@ -38,9 +38,9 @@ def evaluate_occupancy(
 ) -> OccupancyMetrics:
     """Compare the voxels and the 2-D grid of a map with the truth in its axes and cells.
 
-    Results are with a tolerance of one cell (26 neighbours in 3-D, 8 in the grid), and without.
-    With it, a true cell is found if an estimated cell of its state is that near, and an estimated
-    cell is wrong if no true one is: IoU = found / (true + wrong). Log-odds above 0 are occupied.
+    Results are with a tolerance of one cell (26 neighbours in 3-D, 8 in the grid), and without: an
+    estimated cell is wrong if no true one of its state is that near, a true one found if an
+    estimated one is. IoU = found / (true + wrong). Log-odds above 0 are occupied.
     """
     _check(voxels, grid, truth)
     occupied = voxels.keys[voxels.log_odds > 0]

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from recon.core.errors import CalibrationError, MatchingError, SourceError
@@ -26,7 +25,7 @@ from recon.core.values import (
     RectifiedPair,
     StereoPair,
 )
-from recon.core.values.arrays import Float32, Int32
+from recon.core.values.arrays import Float32
 from recon.core.values.camera import depth_from_disparity
 from recon.evaluation.disparity import evaluate_disparity
 from recon.io.middlebury import read_middlebury_calib, read_middlebury_scene
@@ -138,18 +137,15 @@ class PrintedMatcher:
         least, best = np.full(size, np.iinfo(np.int64).max), np.zeros(size, dtype=np.float32)
         for d in range(min(pair.camera.ndisp or usual_ndisp(pair.camera.width_px), size[1])):
             difference = left[:, d:] - right[:, : right.shape[1] - d]
-            sums = _patch_sums(difference if self.signed else np.abs(difference), self.patch_px)
+            compared = (difference if self.signed else np.abs(difference)).astype(np.int64)
+            # Sums over all patches, by an integral image.
+            n, table = self.patch_px, np.pad(compared, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
+            sums = table[n:, n:] - table[:-n, n:] - table[n:, :-n] + table[:-n, :-n]
             # Strictly less: of equal sums the smallest disparity wins.
             better = sums < least[:, d:]
             least[:, d:][better] = sums[better]
             best[:, d:][better] = d
         return best
-
-
-def _patch_sums(compared: Int32, n: int) -> NDArray[Any]:
-    """Return int64 (H - n + 1, W - n + 1), sums over all patches by an integral image."""
-    table = np.pad(compared.astype(np.int64), ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
-    return np.asarray(table[n:, n:] - table[:-n, n:] - table[n:, :-n] + table[:-n, :-n])
 
 
 def read_experiments(folder: Path | None = None) -> list[Experiment]:
@@ -162,16 +158,17 @@ def read_experiments(folder: Path | None = None) -> list[Experiment]:
     if missing := [scene for scene in EXPERIMENTS.values() if not (folder / scene).is_dir()]:
         got = f"no folder {', '.join(missing)}"
         raise SourceError("scenes of the paper are missing", where=folder, got=got, hint=_WHERE)
-    return [_read_experiment(number, folder / scene) for number, scene in EXPERIMENTS.items()]
-
-
-def _read_experiment(number: int, folder: Path) -> Experiment:
-    scene, calib = read_middlebury_scene(folder), read_middlebury_calib(folder / "calib.txt")
-    # The file rounds doffs and the principal points independently; doffs defines depth.
-    doffs_px = calib.camera.doffs_px if calib.doffs_px is None else calib.doffs_px
-    camera = replace(calib.camera, cx_right_px=calib.camera.cx_px + doffs_px)
-    files = tuple(sorted(path for path in folder.iterdir() if path.is_file()))
-    return Experiment(number, scene.name, scene.pair, camera, scene.truth, files)
+    experiments = []
+    for number, name in EXPERIMENTS.items():
+        scene = read_middlebury_scene(folder / name)
+        calib = read_middlebury_calib(folder / name / "calib.txt")
+        # The file rounds doffs and the principal points independently; doffs defines depth.
+        doffs_px = calib.camera.doffs_px if calib.doffs_px is None else calib.doffs_px
+        camera = replace(calib.camera, cx_right_px=calib.camera.cx_px + doffs_px)
+        files = tuple(sorted(path for path in (folder / name).iterdir() if path.is_file()))
+        found = Experiment(number, scene.name, scene.pair, camera, scene.truth, files)
+        experiments.append(found)
+    return experiments
 
 
 def camera_of_table_1(camera: RectifiedCamera) -> RectifiedCamera:
@@ -243,7 +240,15 @@ def try_patches(
             if method == CORRECTED:
                 own = {**config.matching.sad.model_dump(), "window_px": patch_px}
                 matcher = SadMatcher(SadSettings.parse(own), threads)
-            figures.append(_patch_figures(patch_px, matcher.match(pair), experiment.truth))
+            found, truth = matcher.match(pair), experiment.truth
+            bad = right = error = None
+            if truth is not None:
+                metrics = evaluate_disparity(found, truth, (BAD_PX,))
+                bad, error = metrics.bad[BAD_PX], metrics.avgerr_px
+                right = 100 - bad - metrics.invalid
+            valid = {"patch_px": patch_px, "valid_percent": 100 * float(found.valid.mean())}
+            judged = {"bad_percent": bad, "right_percent": right, "avgerr_px": error}
+            figures.append(dict(to_json({**valid, **judged})))
     return figures
 
 
@@ -269,14 +274,3 @@ def _printed_pair(experiment: Experiment) -> RectifiedPair:
     pair, rectifier = experiment.pair, Rectifier(experiment.camera)
     left, right = (to_grey(image, "paper") for image in rectifier.warp(pair))
     return replace(rectifier.rectify(pair), left=left, right=right)
-
-
-def _patch_figures(patch_px: int, found: Disparity, truth: DisparityTruth | None) -> dict[str, Any]:
-    """Return the fractions of pixels with a value, wrong and right, and the mean error in pixels."""
-    bad = right = error = None
-    if truth is not None:
-        metrics = evaluate_disparity(found, truth, (BAD_PX,))
-        bad, error = metrics.bad[BAD_PX], metrics.avgerr_px
-        right = 100 - bad - metrics.invalid
-    valid = {"patch_px": patch_px, "valid_percent": 100 * float(found.valid.mean())}
-    return dict(to_json({**valid, "bad_percent": bad, "right_percent": right, "avgerr_px": error}))

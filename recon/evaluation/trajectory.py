@@ -97,7 +97,7 @@ def evaluate_trajectory(
     """Return the errors of an estimated trajectory, see `compare_paths`.
 
     Poses of two files with times (TUM) are associated by time, as `recon evaluate trajectory` does;
-    all others are compared in order. `Trajectory` values are, too: their times may be mere numbers.
+    all others, and `Trajectory` values, whose times may be mere numbers, are compared in order.
 
     Args:
         estimate: The estimate, or its KITTI or TUM file.
@@ -132,9 +132,8 @@ def compare_paths(
     """Compare an estimated trajectory with the true one, pose by pose.
 
     Relative errors follow the KITTI development kit: means over `choose_segments` of the error of
-    the motion, divided by the length. A drive too short for two of KITTI's lengths uses 50 and
-    100 m, one of 50 m or less half its length. The scale of the alignment affects all errors, its
-    rigid part only the ATE.
+    the motion, divided by the length. The scale of the alignment affects all errors, its rigid part
+    only the ATE.
 
     Ref: Geiger, Lenz, Urtasun, "Are we ready for autonomous driving?", CVPR 2012; Sturm et al., "A
     benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
@@ -209,10 +208,7 @@ def _check_orders(
     ratio = off(estimate, truth)
     if ratio < _NONSENSE:
         return
-    others = {
-        "estimate": off(reordered(estimate), truth),
-        "truth": off(estimate, reordered(truth)),
-    }
+    others = {"estimate": off(reordered(estimate), truth), "truth": off(estimate, reordered(truth))}
     name, least = min(others.items(), key=lambda item: item[1])
     if least < 0.1 * ratio:
         what = f"the quaternions of the {name} are not in the order of TUM, qx qy qz qw"
@@ -284,8 +280,8 @@ def choose_segments(
 ) -> Segments:
     """Choose segments by the true path length (N,) from the first pose to each.
 
-    Without lengths: those of the benchmark that fit, or shorter ones; without a step between
-    starts: 10 frames, or 1 for the shorter lengths.
+    Without lengths: the benchmark's that fit, for a shorter drive 50 and 100 m, or half its length;
+    without a step between starts: 10 frames, or 1 for the shorter lengths.
     """
     lengths = lengths_m or KITTI_LENGTHS_M
     segments = segments_of(distances_m, lengths, step_frames or KITTI_STEP_FRAMES)
@@ -355,8 +351,7 @@ _LEAST_MEDIAN_RAD: Final = 5e-5
 def interpolated_poses(path: Trajectory) -> Bool:
     """Return bool (N,): poses along which the path turns at one rate, as it does nowhere else.
 
-    A vehicle's rates of turn change from frame to frame. A path that turns evenly for the most
-    part has none, as rendered ones do.
+    A path that turns evenly for the most part has none, as rendered ones do.
     """
     found = np.zeros(len(path), np.bool_)
     if len(path) < _LEAST_CHANGES + 2:

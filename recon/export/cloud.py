@@ -16,11 +16,8 @@ from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Bool
 from recon.export.occupancy import GROUND_RATIO, Flattening
 from recon.export.product import ExportContext, ExportResult
-from recon.io.models.copc import write_copc
-from recon.io.models.e57 import write_e57
-from recon.io.models.las import write_las
-from recon.io.models.npz import write_npz
-from recon.io.models.pcd import write_pcd
+from recon.io.models.columns import write_npz, write_pcd
+from recon.io.models.las import write_copc, write_e57, write_las
 from recon.io.models.ply import write_ply_tiles
 from recon.map.ground.surface import MAX_TILT_DEG, WINDOW_M, GroundSurface
 from recon.map.tiles import Tiles

@@ -13,7 +13,7 @@ from recon.core.values.arrays import Float64, Int32
 from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext, ExportResult
 from recon.export.rasters import ground_slopes
-from recon.io.models.nav2 import write_nav2_costs
+from recon.io.models.rasters import write_nav2_costs
 from recon.io.models.ros_bag import Message, header, pose, write_bag
 from recon.map.ground.surface import GroundSurface, Raster
 from recon.map.ground.traverse import UNSURE, costs, judge, measure_relief, widened

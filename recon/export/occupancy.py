@@ -18,8 +18,8 @@ from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64, Int32
 from recon.core.values.grid import log_odds
 from recon.export.product import ExportContext, ExportResult
-from recon.io.models.nav2 import write_nav2
 from recon.io.models.octomap import write_octomap_tiles
+from recon.io.models.rasters import write_nav2
 from recon.map.builders import MIN_PROBABILITY
 from recon.map.cut import Rectangle, TileKey
 from recon.map.ground.axes import base_axes

@@ -22,8 +22,7 @@ from recon.export.mesh.pieces import WHOLE
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.io.images.disparity import fitting_scale, write_disparity_png, write_pfm
 from recon.io.images.image import read_image, write_image
-from recon.io.models.mesh import write_mesh
-from recon.io.models.mlp import Photo, write_mlp
+from recon.io.models.mesh import Photo, write_mesh, write_mlp
 from recon.io.models.ply import write_ply
 from recon.stereo.frame import ReconstructedFrame
 

@@ -19,7 +19,7 @@ from recon.core.values import UNKNOWN, PointCloud
 from recon.core.values.arrays import Bool, Float64, Int64
 from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext, ExportResult
-from recon.io.models.geotiff import RasterFile, RasterPlace, write_geotiff
+from recon.io.models.rasters import RasterFile, RasterPlace, write_geotiff
 from recon.map.ground.surface import GroundSurface
 
 _ROWS: Final = 256  # of a raster at a time

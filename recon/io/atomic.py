@@ -24,7 +24,7 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     """Give a temporary path to write to, which is renamed to ``path`` if the block succeeds.
 
     It is in the same folder, created if missing, and has the same suffix, by which a library may
-    choose the format. If the block raises, it is removed and a file at ``path`` stays as it was.
+    choose the format. If the block raises, a file at ``path`` stays as it was.
     """
     target = Path(path)
     check_targets([target])

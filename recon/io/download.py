@@ -42,10 +42,7 @@ class _BrokenOffError(Exception):
 def download(
     address: str, path: Path, size: int | None = None, on_bytes: OnBytes = lambda *_: None
 ) -> None:
-    """Download a file of that size, if it is known, or the rest of one that an earlier call began.
-
-    A connection that breaks off is opened again, up to five times in a row without a byte.
-    """
+    """Download a file, or the rest of one that an earlier call began; reopen what breaks off."""
     part, tries = path.with_name(path.name + ".part"), 0
     while True:
         before = _size(part)
@@ -67,8 +64,10 @@ def download(
 def _receive(address: str, part: Path, size: int | None, on_bytes: OnBytes) -> None:
     """Receive the rest of a file, or all of it where the server cannot go on."""
     # One byte is asked for again: a file that is complete has no rest that could be sent.
-    begin, version = max(_size(part) - 1, 0), _version_begun(part)
-    asked = {"Range": f"bytes={begin}-", "If-Range": version} if version else {}
+    begin, known = max(_size(part) - 1, 0), _version_file(part)
+    version = known.read_text(errors="replace") if known.is_file() else ""
+    safe = version.isascii() and version.isprintable()
+    asked = {"Range": f"bytes={begin}-", "If-Range": version} if version and safe else {}
     with _open(address, asked) as response:
         if response.status != http.client.PARTIAL_CONTENT:
             begin = 0
@@ -80,7 +79,11 @@ def _receive(address: str, part: Path, size: int | None, on_bytes: OnBytes) -> N
             what = "the server has another file than the list of data sets"
             got = counted(total, "byte")
             raise DownloadError(what, where=address, got=got, expected=counted(size, "byte"))
-        _need_room(part.parent, (total or 0) - begin)
+        free, needed = shutil.disk_usage(part.parent).free, (total or 0) - begin
+        if needed > free:
+            what = "there is no room for the download"
+            got, expected = f"{free / 1e9:.1f} GB free", f"{needed / 1e9:.1f} GB"
+            raise OutputError(what, where=part.parent, got=got, expected=expected)
         if begin == 0:
             _forget(part)
         version = response.headers.get("Last-Modified") or response.headers.get("ETag", "")
@@ -149,20 +152,6 @@ class _SafeRedirects(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-def _need_room(folder: Path, size: int) -> None:
-    free = shutil.disk_usage(folder).free
-    if size > free:
-        got, expected = f"{free / 1e9:.1f} GB free", f"{size / 1e9:.1f} GB"
-        what = "there is no room for the download"
-        raise OutputError(what, where=folder, got=got, expected=expected)
-
-
-def _version_begun(part: Path) -> str:
-    file = _version_file(part)
-    version = file.read_text(errors="replace") if file.is_file() else ""
-    return version if version.isascii() and version.isprintable() else ""
-
-
 def _version_file(part: Path) -> Path:
     return part.with_name(part.name + ".version")
 
@@ -204,9 +193,9 @@ def unpack(
 ) -> None:
     """Unpack a zip or tar archive, of which only what is ``below`` a folder, into a folder.
 
-    Nothing is written outside of it, and no link: one that stays in the archive is left out, any
-    other refuses it. Files with a suffix in ``without`` are left out; with ``zips``, archives in it
-    are unpacked in their place.
+    Nothing is written outside of it, and no link: one that leads out refuses the archive. Files
+    with a suffix in ``without`` are left out; with ``zips``, archives in it are unpacked in their
+    place.
     """
     most_bytes = _SMALL_BYTES + _MOST_GROWTH * archive.stat().st_size
     with naming(archive):

@@ -10,6 +10,7 @@ import re
 import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from datetime import datetime, timezone
 from functools import wraps
 from itertools import chain
 from os import PathLike
@@ -19,7 +20,7 @@ from typing import Any, Final, ParamSpec, TypeVar, cast
 import numpy as np
 
 from recon.core.errors import FormatError, ReconError
-from recon.core.text import parse_numbers
+from recon.core.text import parse_number, parse_numbers
 from recon.core.values.arrays import Float64
 
 StrPath = str | PathLike[str]
@@ -57,9 +58,8 @@ def naming(path: StrPath) -> Iterator[None]:
 def reading(path: StrPath) -> Iterator[None]:
     """Name the file in every error that is raised while its content is parsed.
 
-    Content from outside can make a parser raise anything. Around parsing, and only there, every
-    exception is a fault of the file; elsewhere it is a fault of ours and must not pass as one.
-    Pipes and devices, whose reading may never end, are refused.
+    Content from outside can make a parser raise anything: around parsing, and only there, every
+    exception is a fault of the file. Pipes and devices, whose reading may never end, are refused.
     """
     try:
         refuse_special(path)
@@ -169,6 +169,18 @@ def read_table(path: StrPath, columns: tuple[int, ...]) -> tuple[Float64, list[i
     return np.array(rows, dtype=np.float64), lines
 
 
+def seconds_of_date(text: str, where: StrPath) -> float:
+    """Return seconds since 1970 of a date and time in UTC, with more digits than Python reads."""
+    whole, _, part = text.strip().replace("T", " ").replace("/", "-").partition(".")
+    try:
+        whole.encode("ascii")
+        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
+        return moment.timestamp() + parse_number(f"0.{part or 0}")
+    except ValueError as error:
+        what, expected = "not a time", "2011-09-26 13:02:25.964389445"
+        raise FormatError(what, where=where, got=text[:40], expected=expected) from error
+
+
 def parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[float]:
     """Return the numbers of a row with one of so many ``columns``."""
     if len(words) not in columns:
@@ -186,10 +198,7 @@ def parse_row(words: list[str], columns: tuple[int, ...], where: str) -> list[fl
 
 
 def refuse_links(folder: Path, *, below: Path | None = None) -> None:
-    """Refuse a folder of ours that has links in it, which may lead to files of anybody.
-
-    From a folder around it on, ``below``, it is reached by no link either.
-    """
+    """Refuse a folder of ours that has links in it, or is below a link in the folder ``below``."""
     way = [] if below is None else [folder, *folder.parents][: -len(below.parents) - 1]
     inside = (
         Path(place, name)
@@ -207,11 +216,10 @@ _SAMPLE_BYTES: Final = 1 << 12
 
 
 def fingerprint(files: Iterable[Path], *, samples: int | None = None) -> dict[str, Any]:
-    """Return the number, size and one SHA-256 of a list of files, in that order.
+    """Return the number and size of a list of files, and one SHA-256 of names and bytes, in order.
 
-    The hash covers each file's name and bytes, so a renamed frame changes it too. To tell sources
-    apart without reading a large drive, it covers of each larger file ``samples`` pieces of 4 KiB,
-    evenly spread from its first byte to its last. A pipe or device is a `FormatError`.
+    To tell sources apart without reading a large drive, only ``samples`` pieces of 4 KiB are read
+    of each larger file, evenly spread from its first byte to its last. A pipe is a `FormatError`.
     """
     digest, count, size = hashlib.sha256(), 0, 0
     for path in files:

@@ -1,7 +1,4 @@
-"""What an inertial unit measured, in EuRoC's files, and where they say that it is.
-
-A file that is damaged in places is used as far as it goes: the drive can be mapped without.
-"""
+"""What an inertial unit measured, in EuRoC's files; damaged ones are used as far as they go."""
 
 from __future__ import annotations
 
@@ -95,12 +92,10 @@ def _rigid(T: Float64) -> Float64:
 
 
 def read_axes(imu: Path, camera: Path, chain: Path | None) -> tuple[Float64 | None, str]:
-    """Return ``T_camera_imu`` (4, 4) as files say, None = they do not; and what is wrong with them.
+    """Return ``T_camera_imu`` (4, 4), None = no file says it; and what is wrong with the files.
 
-    Args:
-        imu: ``sensor.yaml`` of the unit.
-        camera: That of the left camera.
-        chain: The calibration of both cameras, where that has none.
+    ``imu`` and ``camera`` are the ``sensor.yaml`` of the unit and of the left camera; ``chain`` is
+    the calibration of both cameras, where that has none.
     """
     try:
         if camera.is_file():

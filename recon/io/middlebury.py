@@ -15,7 +15,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.values import DisparityTruth, RectifiedCamera, StereoPair, check_size
-from recon.core.values.arrays import Bool, Float32, Float64, UInt8, size_text
+from recon.core.values.arrays import Float32, UInt8, size_text
 from recon.io.fields import Fields
 from recon.io.files import StrPath, read_table, read_text, reader, resolved
 from recon.io.images.disparity import read_disparity_png, read_pfm
@@ -70,26 +70,16 @@ _EVAL3: Final = Layout("im0", "im1", "disp0GT", "disp1GT", calibrated=True)
 
 @dataclass(frozen=True, eq=False)
 class MiddleburyScene:
-    """One scene with all data of its folder.
-
-    Attributes:
-        generation: Layout of the folder: "2005" includes 2006, and "2014" includes MiddEval3.
-        camera: None if none is published: 2001, 2003, and 2005 or 2006 without ``dmin.txt``.
-            Matching can then use a `stand_in_camera`.
-        truth: True disparity of the left image, or None if the folder has none.
-        ndisp: Number of disparities to search, or None if it is not published.
-        isint: True if results are rounded to whole pixels before comparison.
-        full_size_factor: Full-size pixels, in which the benchmark counts, per pixel of these.
-    """
+    """One scene with all data of its folder; its years are those of the layout."""
 
     name: str
-    generation: Generation
+    generation: Generation  # "2005" includes 2006, and "2014" includes MiddEval3
     pair: StereoPair
-    camera: RectifiedCamera | None
-    truth: DisparityTruth | None
-    ndisp: int | None
-    isint: bool
-    full_size_factor: float
+    camera: RectifiedCamera | None  # None = not published: 2001, 2003, or without ``dmin.txt``
+    truth: DisparityTruth | None  # of the left image
+    ndisp: int | None  # number of disparities to search; None = not published
+    isint: bool  # whether results are rounded to whole pixels before comparison
+    full_size_factor: float  # full-size pixels, in which the benchmark counts, per pixel of these
 
 
 @reader
@@ -97,8 +87,7 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
     """Read one scene of any year.
 
     Raises:
-        FormatError: The folder is not a Middlebury scene, or a file in it is missing, damaged or
-            of another size than the left image.
+        FormatError: The folder is not a scene, or a file is missing, damaged or of another size.
         CalibrationError: The calibration cannot give depth.
     """
     path = resolved(folder)
@@ -110,13 +99,16 @@ def read_middlebury_scene(folder: StrPath) -> MiddleburyScene:
     height_px, width_px = pair.left.shape[:2]
     units, root = units_of(layout, width_px, height_px, path), scene_root(path)
     calib = _read_calib(root, units, width_px, height_px)
+    ndisp, info = calib.camera.ndisp if calib else None, path / "v2eval" / "info.txt"
+    if calib is None and info.is_file():  # of version 2: grey levels per pixel, largest disparity
+        ndisp = int(read_table(info, (1, 2))[0].ravel()[-1]) + 1
     return MiddleburyScene(
         name=path.name,
         generation=units.generation,
         pair=pair,
         camera=calib.camera if calib else None,
         truth=_read_truth(root, layout, units.levels, (height_px, width_px)),
-        ndisp=calib.camera.ndisp if calib else _read_ndisp(path),
+        ndisp=ndisp,
         isint=calib.isint if calib else False,
         full_size_factor=units.factor,
     )
@@ -197,7 +189,7 @@ def _factor_of_2014(folder: Path, width_px: int) -> float:
 
 @dataclass(frozen=True)
 class MiddleburyCalib:
-    """The content of a ``calib.txt``, in metres; ``doffs_px`` is as in the file, if there."""
+    """The content of a ``calib.txt``, metres; ``doffs_px`` is as in the file, if there."""
 
     camera: RectifiedCamera
     isint: bool = False
@@ -210,16 +202,6 @@ def read_middlebury_calib(path: StrPath) -> MiddleburyCalib:
     fields = Fields(dict(_CALIB_LINE.findall(read_text(path))))
     cam0, cam1 = (fields.numbers(key, (3, 3)) for key in ("cam0", "cam1"))
     doffs_px = fields.number("doffs")
-    _check_views(cam0, cam1, doffs_px)
-    size = (fields.count("width"), fields.count("height"))
-    camera = RectifiedCamera.from_matrices(cam0, cam1, fields.number("baseline") / 1000, *size)
-    if "ndisp" in fields:
-        camera = replace(camera, ndisp=fields.count("ndisp"))
-    isint = "isint" in fields and fields.number("isint") != 0
-    return MiddleburyCalib(camera, isint, doffs_px)
-
-
-def _check_views(cam0: Float64, cam1: Float64, doffs_px: float) -> None:
     if not np.allclose(cam0[[0, 1, 1], [0, 1, 2]], cam1[[0, 1, 1], [0, 1, 2]], rtol=1e-4):
         raise CalibrationError("cam0 and cam1 have different focal lengths or rows")
     apart_px = cam1[0, 2] - cam0[0, 2]
@@ -227,6 +209,12 @@ def _check_views(cam0: Float64, cam1: Float64, doffs_px: float) -> None:
     if abs(apart_px - doffs_px) > 0.01:
         what = "doffs is not the difference of the principal points"
         raise CalibrationError(what, got=f"{doffs_px:g}", expected=f"{apart_px:g}")
+    size = (fields.count("width"), fields.count("height"))
+    camera = RectifiedCamera.from_matrices(cam0, cam1, fields.number("baseline") / 1000, *size)
+    if "ndisp" in fields:
+        camera = replace(camera, ndisp=fields.count("ndisp"))
+    isint = "isint" in fields and fields.number("isint") != 0
+    return MiddleburyCalib(camera, isint, doffs_px)
 
 
 def _read_calib(path: Path, units: Units, width_px: int, height_px: int) -> MiddleburyCalib | None:
@@ -255,37 +243,29 @@ def stand_in_camera(width_px: int, height_px: int, ndisp: int | None = None) -> 
     return RectifiedCamera(float(width_px), cx_px, cy_px, cx_px, 1.0, width_px, height_px, ndisp)
 
 
-def _read_ndisp(path: Path) -> int | None:
-    """Read ``info.txt`` of the version 2 benchmark: grey levels per pixel, largest disparity."""
-    info = path / "v2eval" / "info.txt"
-    return int(read_table(info, (1, 2))[0].ravel()[-1]) + 1 if info.is_file() else None
-
-
 def _read_truth(
     folder: Path, layout: Layout, levels: float | None, shape: tuple[int, int]
 ) -> DisparityTruth | None:
-    """Read the truth of the left image, and which pixels both cameras see.
-
-    By a mask, else where the true disparities of both images agree, else everywhere.
-    """
+    """Read the truth of the left image, and by a mask or that of the right one what both see."""
     values = _read_disparity(folder, layout.truth_left, levels, shape)
     if values is None:
         return None
-    seen = _read_mask(folder, shape)
-    if seen is None:
-        right = _read_disparity(folder, layout.truth_right, levels, shape)
-        everywhere = np.ones(shape, bool)
-        seen = everywhere if right is None else cross_check(values, right, _TOLERANCE_PX)
+    seen = np.ones(shape, bool)
+    mask = next((folder / name for name in _MASKS if (folder / name).is_file()), None)
+    if mask is not None:
+        grey = read_grey_levels(mask)
+        _check_shape(mask, grey, shape)
+        seen = np.asarray(grey == _SEEN_BY_BOTH)
+    elif (right := _read_disparity(folder, layout.truth_right, levels, shape)) is not None:
+        # Where both disparities describe the same point.
+        width = values.shape[1]
+        columns = np.rint(np.arange(width) - np.nan_to_num(values, nan=2.0 * width)).astype(
+            np.int64
+        )
+        inside = (columns >= 0) & (columns < width)
+        there = np.take_along_axis(right, np.clip(columns, 0, width - 1), axis=1)
+        seen = np.asarray(inside & (np.abs(there - values) <= _TOLERANCE_PX))
     return DisparityTruth(values, np.isfinite(values) & seen)
-
-
-def cross_check(left: Float32, right: Float32, tolerance_px: float) -> Bool:
-    """Return bool (H, W), where both disparities ``x_left - x_right`` describe the same point."""
-    height, width = left.shape
-    columns = np.rint(np.arange(width) - np.nan_to_num(left, nan=2.0 * width)).astype(np.int64)
-    inside = (columns >= 0) & (columns < width)
-    there = right[np.arange(height)[:, None], np.clip(columns, 0, width - 1)]
-    return np.asarray(inside & (np.abs(there - left) <= tolerance_px))
 
 
 def _read_disparity(
@@ -297,15 +277,6 @@ def _read_disparity(
     values = read_pfm(path) if levels is None else read_disparity_png(path, scale=levels)
     _check_shape(path, values, shape)
     return values
-
-
-def _read_mask(folder: Path, shape: tuple[int, int]) -> Bool | None:
-    path = next((folder / name for name in _MASKS if (folder / name).is_file()), None)
-    if path is None:
-        return None
-    levels = read_grey_levels(path)
-    _check_shape(path, levels, shape)
-    return np.asarray(levels == _SEEN_BY_BOTH)
 
 
 def _check_shape(path: Path, image: Float32 | UInt8, expected: tuple[int, int]) -> None:

@@ -1,4 +1,4 @@
-"""Positions that receivers and total stations write: NMEA, RTKLIB, KITTI's OXTS, and tables."""
+"""Measured positions: of receivers (NMEA, RTKLIB, KITTI's OXTS, tables), and of control points."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from datetime import datetime, timedelta, timezone
 from functools import reduce
 from operator import xor
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from recon.core.errors import EvaluationError, FormatError, require
 from recon.core.text import counted, parse_numbers
 from recon.core.values.arrays import Float64
-from recon.io.files import StrPath, read_lines, read_table, read_text, reader
+from recon.io.files import StrPath, read_lines, read_table, read_text, reader, seconds_of_date
 from recon.io.models.las import check_crs
 from recon.io.trajectory import check_positions
 
@@ -115,11 +115,7 @@ def read_positions(path: StrPath) -> Positions:
 
 
 def in_order(found: Positions, path: StrPath) -> Positions:
-    """Return positions in the order of time, without those that say that there is none.
-
-    Raises:
-        FormatError: There is none, or one is no place on earth.
-    """
+    """Return positions in the order of time; those without a place are left out."""
     good = np.isfinite(found.places).all(axis=1) & np.isfinite(found.times_s)
     if found.degrees:
         good &= np.abs(found.places[:, :2]).max(axis=1, initial=0.0) > _NO_PLACE_DEG
@@ -172,17 +168,13 @@ def _read_named(path: Path, columns: dict[str, int]) -> Positions:
         if line.strip() and not line.lstrip().startswith("#")
     ]
     used = [columns[name] for name in ("time", "lat", "lon", "height", "sigma")]
-    table = np.array([_numbers(row, [*filter(_is_there, used)], path) for row in rows])
+    table = np.array([_numbers(row, [n for n in used if n >= 0], path) for row in rows])
     if not len(table):
         raise FormatError("the file has no position", where=path)
     sigma_m = np.full((len(table), 3), np.nan)
     if table.shape[1] == 5:
         sigma_m[:] = table[:, 4:]
     return Positions(table[:, 0], table[:, 1:4], sigma_m, degrees=True)
-
-
-def _is_there(column: int) -> bool:
-    return column >= 0
 
 
 def _numbers(words: Sequence[str], columns: Sequence[int], path: Path) -> list[float]:
@@ -194,7 +186,6 @@ def _numbers(words: Sequence[str], columns: Sequence[int], path: Path) -> list[f
 
 
 def _read_oxts(folder: Path) -> Positions:
-    """Read a folder ``oxts`` of KITTI's raw data, or one that has it."""
     folder = folder / "oxts" if (folder / "oxts").is_dir() else folder
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
@@ -204,26 +195,14 @@ def _read_oxts(folder: Path) -> Positions:
     if len(lines) != len(files):
         got, expected = counted(len(lines), "time"), counted(len(files), "time")
         raise FormatError("wrong number of times", where=folder, got=got, expected=expected)
-    times_s = [_seconds(line, folder / "timestamps.txt") for line in lines]
+    times_s = [seconds_of_date(line, folder / "timestamps.txt") for line in lines]
     # Latitude, longitude, altitude; accuracy of the position (1 sigma) is number 23.
     rows = np.array([_numbers(read_text(one).split(), (0, 1, 2, 23), one) for one in files])
     sigma_m = np.repeat(rows[:, 3:], 3, axis=1)
     return Positions(np.array(times_s), rows[:, :3], sigma_m, degrees=True, heights=_ELLIPSOID)
 
 
-def _seconds(text: str, path: Path) -> float:
-    """Return seconds since 1970 of a date and time in UTC, with more digits than Python reads."""
-    whole, _, part = text.strip().replace("T", " ").replace("/", "-").partition(".")
-    try:
-        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
-        return moment.timestamp() + float(f"0.{part or 0}")
-    except ValueError as error:
-        what, expected = "not a time", "2011-09-26 13:02:25.964"
-        raise FormatError(what, where=path, got=text[:40], expected=expected) from error
-
-
 def _read_rtklib(path: Path) -> Positions:
-    """Read a solution of RTKLIB: its last line of ``%`` names the columns."""
     lines = read_lines(path)
     heads = [line.lstrip("% ") for line in lines if line.startswith("%")]
     names = heads[-1].split() if heads else []
@@ -254,7 +233,7 @@ def _read_rtklib(path: Path) -> Positions:
 def _on_ellipsoid(table: Float64) -> tuple[Float64, Float64]:
     """Return latitude, longitude and height, and standard deviations east, north and up (N, 3).
 
-    ``table`` (N, 9) has coordinates from the centre of the earth, their standard deviations, and
+    ``table`` (N, 9) is RTKLIB's: coordinates from the centre of the earth, their deviations, and
     signed roots of the covariances of x and y, y and z, z and x.
     """
     pyproj = require("pyproj", extra="survey")
@@ -273,16 +252,13 @@ def _on_ellipsoid(table: Float64) -> tuple[Float64, Float64]:
 
 def _rtklib_time(words: Sequence[str], path: Path, *, gps: bool) -> float:
     if "/" in words[0]:
-        seconds = _seconds(" ".join(words), path)
+        seconds = seconds_of_date(" ".join(words), path)
     else:  # week and seconds
         week, of_week = _numbers(words, (0, 1), path)
         seconds = (_GPS_EPOCH + timedelta(weeks=week, seconds=of_week)).timestamp()
-    return seconds - _leap_seconds(seconds) if gps else seconds
-
-
-def _leap_seconds(time_s: float) -> int:
-    moment = datetime.fromtimestamp(time_s, timezone.utc)
-    return next((n for year, month, n in _LEAPS if (moment.year, moment.month) >= (year, month)), 0)
+    at = datetime.fromtimestamp(seconds, timezone.utc)
+    leaps = next((n for year, month, n in _LEAPS if (at.year, at.month) >= (year, month)), 0)
+    return seconds - leaps if gps else seconds
 
 
 def _read_nmea(path: Path) -> Positions:
@@ -299,7 +275,9 @@ def _read_nmea(path: Path) -> Positions:
             north, east, up = _numbers(words, (5, 6, 7), path)
             deviations[words[0]] = [east, north, up]
         elif kind == "GGA" and len(words) > 8 and words[5] not in ("", "0"):
-            time_s = _time_of_day(words[0], path)
+            clock = words[0][:2], words[0][2:4], words[0][4:]
+            hours, minutes, seconds = _numbers(clock, (0, 1, 2), path)
+            time_s = 3600.0 * hours + 60.0 * minutes + seconds
             # Midnight may come before the new date.
             time_s += day_s + (86400.0 if day_s + time_s < before_s - 43200.0 else 0.0)
             before_s = time_s
@@ -324,27 +302,127 @@ def _sentences(path: Path) -> Iterator[tuple[str, list[str]]]:
     """Yield kind and fields of the sentences whose checksum is right."""
     for line in read_text(path).splitlines():
         content, star, checksum = line.strip().lstrip("$").partition("*")
-        if not star or not _matches(content, checksum):
+        if not star or f"{reduce(xor, content.encode(), 0):02X}" != checksum.strip().upper():
             continue
         kind, *words = content.split(",")
         yield kind[2:], words
 
 
-def _matches(content: str, checksum: str) -> bool:
-    return f"{reduce(xor, content.encode(), 0):02X}" == checksum.strip().upper()
-
-
 def _day(year: str, month: str, day: str, path: Path) -> float:
     century = 0 if len(year) == 4 else 1900 if int(year) >= 70 else 2000
-    return _seconds(f"{century + int(year)}-{month}-{day} 00:00:00", path)
-
-
-def _time_of_day(text: str, path: Path) -> float:
-    hours, minutes, seconds = _numbers([text[:2], text[2:4], text[4:]], (0, 1, 2), path)
-    return 3600.0 * hours + 60.0 * minutes + seconds
+    return seconds_of_date(f"{century + int(year)}-{month}-{day} 00:00:00", path)
 
 
 def _degrees(text: str, side: str, path: Path) -> float:
     point = text.find(".") if "." in text else len(text)
     degrees, minutes = _numbers([text[: point - 2] or "0", text[point - 2 :]], (0, 1), path)
     return (degrees + minutes / 60.0) * (-1.0 if side in ("S", "W") else 1.0)
+
+
+_UTM: Final = re.compile(r"WGS84 UTM (0?[1-9]|[1-5]\d|60)([NS])$", re.IGNORECASE)
+_SYSTEM: Final = re.compile(r"(EPSG:\d+|\+proj|WGS84 UTM )", re.IGNORECASE)
+_CHECK: Final = "check"
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoint:
+    """A point of a survey, and its pixels: columns and rows from the centre of the first one."""
+
+    name: str
+    place_m: Float64  # (3,), east, north and up
+    seen: tuple[tuple[str, Float64], ...]  # name of an image and pixel (2,) in it, for each
+    check: bool = False  # whether it is only compared with
+
+
+@dataclass(frozen=True, eq=False)
+class ControlPoints:
+    """The points of a file, in the coordinate system ``system``."""
+
+    points: tuple[ControlPoint, ...]
+    system: str
+
+
+def is_control(path: StrPath) -> bool:
+    """Return whether a file begins with a coordinate system, as lists of control points do."""
+    if not Path(path).is_file():
+        return False
+    with Path(path).open("rb") as file:
+        return bool(_SYSTEM.match(file.read(200).decode("utf-8-sig", errors="replace").lstrip()))
+
+
+@reader
+def read_control(path: StrPath, crs: str | None = None) -> ControlPoints:
+    """Read a list of control points as OpenDroneMap has it.
+
+    The first line is a coordinate system; the others are ``x y z column row image [name]``, in
+    degrees longitude and latitude if the system has those, else metres; ``check`` behind the name
+    makes it a check point. Rows of one name, or without one of one place, are one point. ``crs`` is
+    the system to convert degrees to (None = that of UTM), or for the system of the file.
+
+    Raises:
+        FormatError: A row is not as above, or rows of one name have different places.
+
+    Ref: https://docs.opendronemap.org/gcp/
+    """
+    lines = [line.split() for line in read_lines(path)]
+    rows = [(n, words) for n, words in enumerate(lines, 1) if words and words[0][0] != "#"]
+    system = " ".join(rows[0][1])
+    if utm := _UTM.match(system):
+        system = f"EPSG:{(32600 if utm[2] in 'Nn' else 32700) + int(utm[1])}"
+    named: dict[str, list[_Row]] = {}
+    for number, words in rows[1:]:
+        row = _row(words, f"{path}:{number}")
+        named.setdefault(row.name or " ".join(words[:3]), []).append(row)
+    if not named:
+        raise FormatError("the file has no control point", where=path)
+    for name, (first, *others) in named.items():
+        if any(row.numbers[:3] != first.numbers[:3] for row in others):
+            got = f"{first.numbers[:3]} and others"
+            raise FormatError("one point has several places", where=f"{path}: {name}", got=got)
+    firsts = np.array([found[0].numbers[:3] for found in named.values()], np.float64)
+    places_m, system = _in_metres(firsts, system, crs, path)
+    points = (
+        ControlPoint(
+            found[0].name or f"point {number}",
+            place_m,
+            tuple((row.image, np.array(row.numbers[3:])) for row in found),
+            any(row.check for row in found),
+        )
+        for number, (found, place_m) in enumerate(zip(named.values(), places_m, strict=True), 1)
+    )
+    return ControlPoints(tuple(points), system)
+
+
+class _Row(NamedTuple):
+    numbers: list[float]  # place, column and row
+    image: str
+    name: str  # empty if there is none
+    check: bool
+
+
+def _row(words: list[str], where: str) -> _Row:
+    name, *more = words[6:] or [""]
+    if len(words) < 6 or more not in ([], [_CHECK]):
+        expected = "x y z column row image [name [check]]"
+        raise FormatError("not a control point", where=where, expected=expected)
+    try:
+        numbers = parse_numbers(words[:5])
+    except ValueError:
+        numbers = []
+    if not (numbers and np.isfinite(numbers).all()):
+        raise FormatError("not five numbers", where=where, got=" ".join(words[:5]))
+    return _Row(numbers, words[5], name, bool(more))
+
+
+def _in_metres(places: Float64, system: str, crs: str | None, path: StrPath) -> tuple[Float64, str]:
+    pyproj = require("pyproj", extra="survey")
+    try:
+        geographic = pyproj.CRS.from_user_input(system).is_geographic
+    except pyproj.exceptions.CRSError as error:
+        raise FormatError("unknown coordinate system", where=path, got=system) from error
+    if not geographic:
+        check_crs(system, path)
+        return places, crs or system
+    degrees = Positions(np.zeros(len(places)), places[:, [1, 0, 2]], np.zeros((0, 3)), degrees=True)
+    metres, chosen = degrees.projected(crs, path)
+    return metres, str(chosen)

@@ -58,8 +58,7 @@ HEADER: Final = "# left image, right image, left time [s], right time [s]\n"
 def read_trajectory(path: StrPath, timestamps_s: Float64 | None = None) -> Trajectory:
     """Read a KITTI trajectory (12 columns), or one with times, see `read_tum`.
 
-    ``timestamps_s``, float64 (N,), are those of a KITTI file. A file that is damaged, or has
-    another number of poses than times, is a `FormatError`.
+    ``timestamps_s``, float64 (N,), are those of a KITTI file. A damaged file is a `FormatError`.
     """
     rows = _read_rows(path, (12, 8, _EUROC_COLUMNS))
     timed = rows.table.shape[1] == 8
@@ -82,9 +81,8 @@ def read_kitti_poses(path: StrPath, timestamps_s: Float64 | None = None) -> Traj
 def read_tum(path: StrPath) -> Trajectory:
     """Read timestamped poses, ``t tx ty tz qx qy qz qw`` per line, or as a header names them.
 
-    So tables of EuRoC, motion capture and ROS are read, whatever else they have; EuRoC's 17 columns
-    need no header. Times are seconds, or in the unit that the header states; since 1970 they may be
-    milli-, micro- or nanoseconds.
+    So tables of EuRoC (which need none), motion capture and ROS are read. Times are seconds, or in
+    the unit that the header states; since 1970 they may be milli-, micro- or nanoseconds.
 
     Raises:
         FormatError: A row is no pose; or, without a header, ``qw qx qy qz`` is clearly meant.
@@ -97,11 +95,8 @@ def write_trajectory(
 ) -> None:
     """Write a trajectory atomically, as TUM has it or, without times, KITTI.
 
-    `read_trajectory` reads it back; a first line of TUM's names the columns, as in `read_tum`.
-
     Raises:
-        OutputError: There is no such format, the trajectory has no pose, or the file cannot be
-            written.
+        OutputError: There is no such format or no pose, or the file cannot be written.
     """
     if form not in ("tum", "kitti"):
         what, expected = "unknown format of a trajectory", "tum or kitti"
@@ -240,11 +235,9 @@ def reordered(path: Trajectory) -> Trajectory:
 
 
 def _check_order(path: Trajectory, where: StrPath) -> None:
-    """Refuse orientations that the path follows only with their quaternions in the other order.
-
-    A rig that moves along one of its own directions does so in one order alone, once it turns; of
-    one that stands, goes straight or is carried anyhow, both orders say the same.
-    """
+    """Refuse orientations that the path follows only with their quaternions in the other order."""
+    # A rig that moves along one of its own directions does so in one order alone, once it turns; of
+    # one that stands, goes straight or is carried anyhow, both orders say the same.
     apart_rad, other_rad = _wander_rad(path), _wander_rad(reordered(path))
     if apart_rad > max(_WANDERS_RAD, _MUCH * other_rad):
         apart, other = (f"{np.degrees(angle):.1f} deg" for angle in (apart_rad, other_rad))

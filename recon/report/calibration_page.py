@@ -14,8 +14,8 @@ from recon.io.atomic import write_bytes
 from recon.io.images.image import read_image
 from recon.report import style
 from recon.report.page import write_page
-from recon.rig.calibrate.bootstrap import CONFIDENCE, MATCH_SIGMA_PX
-from recon.rig.calibrate.result import CalibrationResult, shared_pixels
+from recon.rig.calibrate.stereo import CONFIDENCE, MATCH_SIGMA_PX
+from recon.rig.calibrate.verdict import CalibrationResult, shared_pixels
 from recon.rig.rectification import RectifyResult
 from recon.run.directory import RunDirectory
 from recon.stereo.rectify.lens import epipolar_curves

@@ -11,8 +11,7 @@ import numpy as np
 from recon.core.geometry.se3 import apply
 from recon.core.values import PointCloud, Trajectory
 from recon.core.values.arrays import Float64
-from recon.evaluation.map import nearest_distances
-from recon.evaluation.map_comparison import DriveErrors, MapComparison
+from recon.evaluation.map import DriveErrors, MapComparison, nearest_distances
 from recon.evaluation.trajectory import TrajectoryComparison
 from recon.export.make import Products
 from recon.io.atomic import write_bytes

@@ -45,25 +45,15 @@ _LEAST_SIGMA_PX: Final = 0.05  # no matcher is more accurate on real images
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """The result of an audit.
-
-    Attributes:
-        verdict: good, usable or not usable.
-        findings: Problems found, fatal ones first.
-        figures: All measures, ready for JSON.
-        alignment: Epipolar errors of all pairs together; None if there are too few features.
-        rig: The rig as given, and as the motion of the drive shows it.
-        pairs: What was measured in each pair, and a few of the images.
-        corrected: What `correct_calibration` did, if it was asked to.
-    """
+    """The result of an audit."""
 
     verdict: Verdict
-    findings: tuple[Finding, ...]
-    figures: dict[str, Any]
-    alignment: EpipolarAlignment | None
-    rig: RefinedRig
-    pairs: tuple[PairMeasures, ...] = ()
-    corrected: dict[str, Any] | None = None
+    findings: tuple[Finding, ...]  # problems, fatal ones first
+    figures: dict[str, Any]  # all measures, ready for JSON
+    alignment: EpipolarAlignment | None  # of all pairs together; None = too few features
+    rig: RefinedRig  # as given, and as the motion of the drive shows it
+    pairs: tuple[PairMeasures, ...] = ()  # what was measured in each, and a few images
+    corrected: dict[str, Any] | None = None  # what `correct_calibration` did, if it was asked to
 
     def __repr__(self) -> str:
         found = ", ".join(finding.code for finding in self.findings) or "no findings"
@@ -84,11 +74,7 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     """Check a drive before a long run; ``quick``: as much as `recon map` looks at."""
     check_source(source, stereo=True)
     stage("audit")
-    return audit_of(look_at(source, config, extent=QUICK if quick else THOROUGH), config)
-
-
-def audit_of(look: Look, config: AuditedSettings) -> Audit:
-    """Return what a look at a drive says of it."""
+    look = look_at(source, config, extent=QUICK if quick else THOROUGH)
     findings = find_faults(look, config)
     verdict, seen = verdict_of(findings), tuple(look.sample.pairs)
     alignment, figures = look.geometry.alignment, _figures(look)
@@ -101,8 +87,8 @@ def correct_calibration(
     """Write the calibration with which rows and motion agree, and return how it differs.
 
     It is the one that `recon map` uses; of a drive that is too short for it, rows alone are
-    aligned. The baseline stays. The name of the file tells its format; where that is kalibr's,
-    lenses are the nearest that it knows.
+    aligned. The baseline stays. The name of the file tells its format; kalibr gets the nearest
+    lenses that it knows.
 
     Raises:
         CalibrationError: There are too few features, or what the recording shows is no fault of the
@@ -196,14 +182,12 @@ def _alignment_figures(
 
 
 def check_related(look: Look, config: StereoSettings) -> None:
-    """Refuse a drive if in most of a few pairs nothing shows that left and right belong together.
-
-    Of unrelated images some look alike by chance.
-    """
+    """Refuse a drive if most of a few pairs do not show that left and right belong together."""
     source = look.source
     reconstructor = FrameReconstructor(source.calibration, config)
     seen = [(p.index, reconstructor.inspect(reconstructor.rectify(p))[1]) for p in look.recorded]
     judged = [(index, support) for index, support in seen if support is not None]
+    # In most: of unrelated images some look alike by chance.
     unlike = [(index, support) for index, support in judged if not support.shown]
     if 2 * len(unlike) > len(judged):
         index, support = unlike[-1]
@@ -234,8 +218,8 @@ def check_found(
 ) -> tuple[str, ...]:
     """Return the warnings of a matched pair: those of its faults, and of how little was measured.
 
-    What was inferred counts for nothing. `MatchingError`: nothing was found, or nothing supports
-    that both images belong together.
+    What was inferred counts for nothing. A pair without a match, or of unrelated images, is a
+    `MatchingError`.
     """
     fatal = next((fault.text for fault in faults if fault.fatal), None)
     if support is not None and disparity.measured.any():

@@ -1,4 +1,4 @@
-"""Records pairs from two cameras, or from one that gives both views side by side.
+"""Pairs from two cameras, or from one that gives both views side by side: recorded, or mapped live.
 
 Both cameras are grabbed before either frame is decoded, to keep the exposures close. Recordings
 have the layout of plain folders (see `folders`); the line of a pair in ``frames.csv`` is written
@@ -10,9 +10,10 @@ from __future__ import annotations
 import os
 import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -20,13 +21,17 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import Self
 
-from recon.core.errors import OutputError, ReconError, SourceError
+from recon.core.errors import OutputError, ReconError, SettingsError, SourceError
 from recon.core.settings import Settings
+from recon.core.text import is_count
+from recon.core.values import Rig, StereoPair
 from recon.core.values.arrays import UInt8, size_text
 from recon.io.images.image import write_image
 from recon.io.trajectory import FRAMES, HEADER, CapturedFrame
-from recon.sources.opencv_camera import Camera
+from recon.sources.calibration import CALIBRATE, read_rig
+from recon.sources.live import Camera
 from recon.sources.settings import SourceSettings
+from recon.sources.source import StereoSource
 from recon.sources.video import split_views
 
 _USUAL_RATE_HZ: Final = 30.0  # assumed if a driver does not report its rate
@@ -78,10 +83,7 @@ class CapturedPair:
 
 @contextmanager
 def open_cameras(devices: Iterable[str], settings: CaptureSettings) -> Iterator[tuple[Camera, ...]]:
-    """Open the left and the right camera, or one with both views, for the body of a ``with``.
-
-    ``devices`` are numbers, paths, addresses of streams, or video files.
-    """
+    """Open a left and a right camera, or one with both views, by number, path or address."""
     width, height = settings.width_px, settings.height_px
     size = None if width is None or height is None else (width, height)
     with ExitStack() as stack:
@@ -97,7 +99,7 @@ def capture_pairs(
 ) -> Iterator[CapturedPair]:
     """Yield pairs until the limit is reached, a file ends, or ``stopped`` returns True.
 
-    If one camera loses a frame, the other drops its frame too, so that pairs are nearest in time.
+    Where one camera loses a frame, the other drops its own, so that pairs are nearest in time.
     """
     known_hz = [camera.rate_hz for camera in cameras if np.isfinite(camera.rate_hz)]
     period_s = 1 / (settings.rate_hz or min(known_hz, default=_USUAL_RATE_HZ))
@@ -115,10 +117,7 @@ def capture_pairs(
 
 
 def warm_up(cameras: tuple[Camera, ...], settings: CaptureSettings) -> bool:
-    """Drop the first frames, lock the exposure of the left camera on both, return whether it is.
-
-    Video files keep all frames.
-    """
+    """Drop the first frames of live cameras; return whether the exposure of all is locked."""
     if not all(camera.live for camera in cameras):
         return False
     for _ in range(_WARM_UP_FRAMES):
@@ -279,3 +278,74 @@ def write_pairs(
         writer.join()
     if failed:
         raise failed[0]
+
+
+class CameraSource(StereoSource):
+    """The pairs that cameras take from now on; live if none of them is a video file."""
+
+    name: str
+    calibration: Rig
+    files: Sequence[Path]
+    description = "pairs from cameras"
+
+    def __init__(
+        self,
+        cameras: tuple[Camera, ...],
+        settings: RecordingSettings,
+        calibration: Rig,
+        files: Sequence[Path] = (),
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._cameras, self._settings, self._stopped = cameras, settings, stopped
+        self.calibration, self.files = calibration, files
+        self.name = " and ".join(camera.name for camera in cameras)
+        self.live = all(camera.live for camera in cameras)
+
+    def __len__(self) -> int:
+        """Return the largest number of pairs; 0 = not known."""
+        return self._settings.frames or 0
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Yield the pairs from now on, numbered from 0; the first ``start`` are left out."""
+        taken = capture_pairs(self._cameras, self._settings, self._stopped)
+        for index, pair in islice(enumerate(taken), start, None):
+            yield StereoPair(pair.left, pair.right, pair.left_s, index, f"frame {index}")
+
+
+def is_camera(name: str) -> bool:
+    """Return whether a name is that of a camera, not of a recording: a number, a device, a URL."""
+    number = is_count(name) and not Path(name).exists()
+    return number or "://" in name or name.startswith("/dev/")
+
+
+@contextmanager
+def open_camera_source(
+    devices: Iterable[str],
+    settings: CaptureSettings,
+    source: SourceSettings,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[CameraSource]:
+    """Open cameras as a source, for the body of a ``with`` statement.
+
+    ``source`` names the calibration; its ``end`` is the number of pairs. See `CameraSource`.
+    """
+    if source.shift_frames:
+        raise SettingsError(
+            "images of cameras are paired as they are taken",
+            where="source.shift_frames",
+            got=source.shift_frames,
+            expected=0,
+            hint="record them with recon capture, and map the recording with it",
+        )
+    recording = RecordingSettings.parse({**dict(settings), "frames": source.end})
+    with open_cameras(devices, settings) as cameras:
+        where = " and ".join(camera.name for camera in cameras)
+        if not source.has_camera:
+            raise SourceError("cameras need a calibration", where=where, hint=CALIBRATE)
+        warm_up(cameras, recording)
+        first = next(capture_pairs(cameras, recording, stopped), None)
+        if first is None:
+            raise SourceError("the cameras give no pair", where=where)
+        height_px, width_px = first.left.shape[:2]
+        rig, files = read_rig(source, Path(), (width_px, height_px))
+        yield CameraSource(cameras, recording, rig, files, stopped)

@@ -14,13 +14,12 @@ from recon.core.errors import CalibrationError
 from recon.core.text import to_json
 from recon.core.values import StereoCalibration, StereoPair
 from recon.core.values.arrays import Float64, UInt8, size_text
-from recon.io.cameras.calibration import read_calibration
+from recon.io.cameras.calibration import read_calibration, write_recon_calibration
 from recon.io.cameras.kitti import kitti_cameras_of
-from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.fields import write_yaml
 from recon.io.files import naming
 from recon.rig.uncalibrated import rectify_images
-from recon.sources.image_names import ImagePairs
+from recon.sources.images import ImagePairs
 from recon.sources.one_pair import read_pair
 from recon.stereo.rectify.features import map_pixels, match_exactly
 from recon.stereo.rectify.lens import epipolar_curves, epipolar_lines

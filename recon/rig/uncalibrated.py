@@ -1,8 +1,4 @@
-"""Rectification without a calibration: the simplest change that aligns rows; its scale is unknown.
-
-The images as they are, a small rotation of the right camera, or homographies from the fundamental
-matrix of the two views.
-"""
+"""Rectification without a calibration: the simplest change that aligns rows; up to scale."""
 
 from __future__ import annotations
 
@@ -78,13 +74,10 @@ class UncalibratedRectification:
 def rectify_images(
     pairs: Sequence[tuple[UInt8, UInt8]], count: int = MOST_FEATURES
 ) -> UncalibratedRectification:
-    """Find the simplest change that aligns the rows of grey pairs of one uncalibrated rig.
-
-    ``count`` limits the features of an image; homographies are refined by a second matching.
-    """
+    """Find the simplest change that aligns the rows of grey pairs of one uncalibrated rig."""
     height, width = pairs[0][0].shape
     matched = [match_exactly(left, right, count) for left, right in pairs]
-    # The initial guess may rest on few matches: the second round checks it.
+    # The initial guess may rest on few matches: homographies are refined by a second round.
     found = rectify_features(matched, (width, height), _FEWEST_AT_FIRST)
     if found.model != "homographies":
         return found
@@ -98,7 +91,7 @@ def rectify_features(
 ) -> UncalibratedRectification:
     """Find the simplest change whose held-out epipolar errors are not clearly above the smallest.
 
-    Held out are every second pair or, of fewer than four, every fourth feature. ``min_features``
+    Held out are every second pair or, of fewer than four, every fourth feature; ``min_features``
     must agree on homographies.
     """
     features = pool_features(matched)
@@ -118,7 +111,13 @@ def rectify_features(
     before = _epipolar_errors(fits["raw"], features)
     for name, H in fits.items():
         after = _epipolar_errors(H, features)
-        if name not in blocks or _clearly_above(blocks[name], best) or after.sum() > before.sum():
+        if name not in blocks or after.sum() > before.sum():
+            continue
+        # Clearly above: by two standard errors, and by what features resolve.
+        more = blocks[name] - best
+        deviation = float(more.std(ddof=1)) if len(more) > 1 else 0.0
+        resolved = max(2 * deviation / max(len(more), 1) ** 0.5, _RESOLVED_PX)
+        if len(more) and more.mean() > resolved:
             continue
         # A model that is no homography has to hold for most matches, else there is no geometry.
         enough = 1 if name == "homographies" else max(_MIN_FEATURES, len(features) / 2)
@@ -190,13 +189,6 @@ def _epipolar_errors(H: Homographies, features: PairFeatures) -> Float64:
     return np.minimum(np.abs(left[:, 1] - right[:, 1]), 4 * _INLIER_PX)
 
 
-def _clearly_above(errors: Float64, best: Float64) -> bool:
-    """Return whether errors exceed the best by two standard errors and what features resolve."""
-    more = errors - best
-    deviation = float(more.std(ddof=1)) if len(more) > 1 else 0.0
-    return len(more) > 0 and bool(more.mean() > max(2 * deviation / len(more) ** 0.5, _RESOLVED_PX))
-
-
 def _result(
     model: str, H: Homographies, features: PairFeatures, held_out: Float64
 ) -> UncalibratedRectification:
@@ -222,8 +214,8 @@ def _result(
 def rectifying_homographies(F: Float64, features: PairFeatures, size: Size) -> Homographies:
     """Return float64 (3, 3) for the left and for the right image, which align matching rows.
 
-    Borders stay as near to their places as aligned rows allow, then the right image is shifted so
-    that disparities are positive. The matches are correct ones, ``right.T @ F @ left = 0``.
+    Borders stay as near to their places as aligned rows allow; disparities are positive. The
+    matches are correct ones, ``right.T @ F @ left = 0``.
 
     Ref: Hartley 1999, "Theory and practice of projective rectification", as OpenCV has it.
     """
@@ -245,11 +237,7 @@ def rectifying_homographies(F: Float64, features: PairFeatures, size: Size) -> H
 
 
 def _levelled(views: list[Float64], border: Float64) -> list[Float64]:
-    """Tilt both images together about a horizontal axis, until top and bottom have equal scale.
-
-    Rows stay aligned under (x, y) -> (x, y) / (1 + g·(y - y0)); g makes the third coordinates as
-    even as possible along the borders of both images.
-    """
+    """Tilt both images together about a horizontal axis, until top and bottom have equal scale."""
     points = np.hstack([border, np.ones((len(border), 1))])
     views = [H / (points @ H[2]).mean() for H in views]
     for side, H in zip(("left", "right"), views, strict=True):
@@ -266,6 +254,8 @@ def _levelled(views: list[Float64], border: Float64) -> list[Float64]:
         np.stack([points @ (H[k] - shift * H[2]) for H in views]) for k, shift in ((1, y0), (2, 0))
     )
     rows, depth = (each - each.mean(axis=1, keepdims=True) for each in (rows, depth))
+    # Rows stay aligned under (x, y) -> (x, y) / (1 + g·(y - y0)); this makes the third coordinates
+    # as even as possible along the borders of both images.
     g = -float((rows * depth).sum() / (rows * rows).sum())
     return [np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, g, 1.0 - g * y0]]) @ H for H in views]
 
@@ -303,8 +293,7 @@ def find_fundamental(features: PairFeatures, inlier_px: float) -> tuple[Float64 
 def fit_fundamental(F: Float64, left_px: Float64, right_px: Float64) -> Float64:
     """Refine a fundamental matrix, minimising the absolute distances of inliers (N, 2).
 
-    Ref: Bartoli and Sturm 2004, "Non-linear estimation of the fundamental matrix with minimal
-    parameters".
+    Ref: Bartoli and Sturm 2004, "Non-linear estimation of the fundamental matrix".
     """
     middle = np.concatenate([left_px, right_px]).mean(axis=0)
     scale = 1.0 / max(float(np.abs([left_px - middle, right_px - middle]).mean()), 1e-12)

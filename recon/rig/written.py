@@ -12,8 +12,8 @@ import numpy as np
 
 from recon.core.errors import SettingsError
 from recon.core.values import CameraIntrinsics, Rig
+from recon.io.cameras.calibration import write_recon_calibration
 from recon.io.cameras.opencv_yaml import write_opencv_calibration
-from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.cameras.ros import camera_info_paths, write_camera_info, write_kalibr
 from recon.look.fault import spread_pixels
 from recon.stereo.rectify.epipolar import as_raw
@@ -60,7 +60,7 @@ def write_rig(
     """Write a rig, each file atomically, and return the files: two of ROS, else one.
 
     ``settings`` are those of the rectification that a CameraInfo states; only our own files keep
-    the ``quality``. A form of None is that of the name.
+    the ``quality``; a form of None is that of the name.
     """
     form = form or form_of(path)
     if form == "recon":

@@ -2,11 +2,9 @@
 
 - `source.py`: the base class of every source, which frames are pairs, a part of a drive;
   `registry.py`: the kinds;
-- `kitti.py`, `listed.py` (EuRoC, TUM), `folders.py`, `video.py`, `bag.py`, `one_pair.py`,
+- `kitti.py`, `listed.py` (EuRoC, TUM, RGB-D), `folders.py`, `video.py`, `bag.py`, `one_pair.py`,
   `synthetic.py`: one kind each, or two alike;
-- `rgbd.py`: an image and its depth, which needs no matching;
-- `images.py`: drives in image files, which `image_names.py` and `times.py` pair;
-- `calibration.py`: which calibration is used;
-- `live.py`: a drive that arrives in its own time; `opencv_camera.py`; `bag_prior.py`;
+- `images.py`: drives in image files, paired by name or, in `times.py`, by time;
+- `calibration.py`: which calibration is used; `live.py`: cameras, and drives that are played;
 - `datasets.py`: public data sets and how they are fetched.
 """

@@ -34,10 +34,7 @@ def read_rig(
     size: tuple[int, int],
     cameras: tuple[int, int] | None = None,
 ) -> tuple[Rig, tuple[Path, ...]]:
-    """Return the calibration that the settings name or give in numbers, else that of a folder.
-
-    Also its files. ``size`` is width and height; ``cameras`` are those of a KITTI file, else grey.
-    """
+    """Return the calibration of the settings, else of a folder, for images of a size; its files."""
     check_given_once(settings.calibration, settings)
     if settings.numbers:
         return camera_of_numbers(settings, size), ()

@@ -170,7 +170,11 @@ def _receive(one: Archive, part: Part, work: Path, mirror: str | None) -> dict[s
     address = one.path if mirror is None else f"{mirror.rstrip('/')}/{one.file}"
     path, promised = work / one.file, one.digest
     if kind := part.dataset.digest_beside:
-        promised = _published(f"{address}.{kind}", kind, work)
+        download(f"{address}.{kind}", work / _HASH)
+        word, *_ = read_text(work / _HASH, _HASH_BYTES).split() or [""]
+        if not (word.isalnum() and word.isascii()):
+            raise DownloadError("no hash is there", where=f"{address}.{kind}")
+        promised = f"{kind}:{word.lower()}"
     if not path.is_file():
         with _shown(one) as on_bytes:
             download(address, path, one.bytes, on_bytes)
@@ -185,14 +189,6 @@ def _receive(one: Archive, part: Part, work: Path, mirror: str | None) -> dict[s
         "digest": _digest(path, "sha256"),
         "checked": promised or ("size" if one.bytes else "nothing"),
     }
-
-
-def _published(address: str, kind: str, work: Path) -> str:
-    download(address, work / _HASH)
-    word, *_ = read_text(work / _HASH, _HASH_BYTES).split() or [""]
-    if not (word.isalnum() and word.isascii()):
-        raise DownloadError("no hash is there", where=address)
-    return f"{kind}:{word.lower()}"
 
 
 @contextmanager

@@ -25,16 +25,19 @@ from recon.io.cameras.kitti import kitti_cameras_of
 from recon.io.files import resolved
 from recon.io.trajectory import FRAMES, read_frames
 from recon.sources.calibration import read_rig
-from recon.sources.image_names import find_partners, natural_key, partner_names, split_sides
 from recon.sources.images import (
     ImageFrame,
     ImageSource,
     existing,
+    find_partners,
     image_size,
     is_image,
     list_images,
+    natural_key,
     pair_listed,
     pair_named,
+    partner_names,
+    split_sides,
     stamps_of,
 )
 from recon.sources.settings import SourceSettings
@@ -130,7 +133,13 @@ def _pair(folder: Path, settings: SourceSettings) -> _Pairing:
     frames = _by_name(left, right) if by in {"auto", "name"} else None
     how = "by name"
     if frames is None:
-        frames, how = _by_index(left, right, by, folder), "by their order"
+        if len(left) != len(right) or by == "name":
+            apart = "numbers of left and right images differ"
+            what = "left and right images cannot be paired by name" if by == "name" else apart
+            got = f"{len(left)} left and {counted(len(right), 'right image')}"
+            hint = "give both images of a pair the same name, or their timestamps as names"
+            raise SourceError(what, where=folder, got=got, hint=hint)
+        frames, how = list(zip(left, right, strict=True)), "by their order"
     pairs, listing = pair_named(frames, settings, folder)
     label = f"{views[0].name} and {views[1].name}" if views[0] != views[1] else "one folder"
     found = _Pairing(pairs, listing, None, f"{label}, paired {how}")
@@ -194,16 +203,6 @@ def _place(frame: tuple[Path | None, Path | None]) -> list[tuple[int, str]]:
     stem = (frame[0] or frame[1] or Path()).stem
     numbers = re.findall(r"\d+", stem)
     return [(int(numbers[-1]), "")] if numbers else natural_key(stem)
-
-
-def _by_index(left: list[Path], right: list[Path], by: str, folder: Path) -> _Frames:
-    if len(left) != len(right) or by == "name":
-        apart = "numbers of left and right images differ"
-        what = "left and right images cannot be paired by name" if by == "name" else apart
-        got = f"{len(left)} left and {counted(len(right), 'right image')}"
-        hint = "give both images of a pair the same name, or their timestamps as names"
-        raise SourceError(what, where=folder, got=got, hint=hint)
-    return list(zip(left, right, strict=True))
 
 
 def _with_times(found: _Pairing, path: Path) -> _Pairing:

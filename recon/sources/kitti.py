@@ -34,12 +34,12 @@ from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, read_kitti_offs
 from recon.io.files import resolved
 from recon.io.trajectory import read_kitti_poses
 from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
-from recon.sources.image_names import natural_key
 from recon.sources.images import (
     ImageFrame,
     ImageSource,
     image_size,
     list_images,
+    natural_key,
     pair_listed,
     pair_named,
 )
@@ -51,16 +51,17 @@ _RAW_CALIBRATION: Final = "calib_cam_to_cam.txt"
 
 
 def open_kitti(folder: Path, settings: SourceSettings | None = None) -> ImageSource:
-    """Open a drive of the odometry benchmark, the grey images if it has both kinds.
-
-    Where images were deleted, lines of times.txt and poses.txt are found by numbers in the names.
-    """
+    """Open a drive of the odometry benchmark, the grey images if it has both kinds."""
     if not folder.is_dir():
         raise SourceError("folder does not exist", where=folder)
     pair = _choose_cameras(folder, "image_{}")
     settings = settings or SourceSettings()
     views = [folder / f"image_{camera}" for camera in pair]
-    images, listing = _list_pairs(views[0], views[1], settings)
+    left, right = ({path.name: path for path in list_images(view)} for view in views)
+    names = sorted(left.keys() | right.keys(), key=natural_key)
+    frames = [(left.get(name), right.get(name)) for name in names]
+    # Where images were deleted, lines of times.txt and poses.txt are found by numbers in the names.
+    images, listing = pair_named(frames, settings, folder)
     times, time_files = _read_times(folder, listing, settings)
     rig, calibration_files = _read_rig([folder / "calib.txt"], settings, pair, images[0][0])
     truth, pose_files = _read_truth(folder, times, listing, pair[0])
@@ -87,17 +88,6 @@ def _choose_cameras(folder: Path, pattern: str) -> tuple[int, int]:
         raise SourceError(what, where=folder, got=names[there[0]], expected=expected)
     expected = f"{names[0]} and {names[1]}, or {names[2]} and {names[3]}"
     raise SourceError("folder has no images in KITTI's layout", where=folder, expected=expected)
-
-
-def _list_pairs(
-    left: Path, right: Path, settings: SourceSettings
-) -> tuple[list[tuple[Path, Path]], FrameList]:
-    names = [{path.name for path in list_images(folder)} for folder in (left, right)]
-    frames = [
-        (left / name if name in names[0] else None, right / name if name in names[1] else None)
-        for name in sorted(names[0] | names[1], key=natural_key)
-    ]
-    return pair_named(frames, settings, left.parent)
 
 
 def _read_times(

@@ -112,7 +112,7 @@ def read_pair_input(
 ) -> PairInput:
     """Read two images with their calibration; without one the pair is rectified.
 
-    Of ``known`` numbers of the camera, the focal length may be that in the EXIF data of the left
+    Of ``known`` numbers of the camera, a missing focal length is that of the EXIF data of the left
     image, and without a baseline the cloud is up to scale: notes say so.
     """
     if known is not None:

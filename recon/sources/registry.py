@@ -9,19 +9,17 @@ from typing import Final, NamedTuple
 
 from recon.core.errors import SourceError
 from recon.io.files import StrPath, reading
-from recon.io.images.video import VIDEOS
 from recon.io.middlebury import find_layout
 from recon.io.trajectory import FRAMES
 from recon.sources.bag import BAGS, find_bags, open_bag
 from recon.sources.calibration import RIG_FILE
 from recon.sources.folders import find_views, open_folders
 from recon.sources.kitti import open_kitti, open_kitti_raw
-from recon.sources.listed import is_euroc, list_files, open_euroc, open_tum
+from recon.sources.listed import DEPTH, is_euroc, list_files, open_euroc, open_rgbd, open_tum
 from recon.sources.one_pair import open_middlebury
-from recon.sources.rgbd import DEPTH, open_rgbd
 from recon.sources.settings import SourceSettings
 from recon.sources.source import Recording, StereoSource
-from recon.sources.video import list_videos, open_video_source
+from recon.sources.video import VIDEOS, list_videos, open_video_source
 
 
 class Kind(NamedTuple):
@@ -47,8 +45,7 @@ KINDS: Final = (
     Kind("video", "videos", open_video_source, lambda at, _: list_videos(at), VIDEOS),
     Kind("folders", _PLAIN, open_folders, find_views),
 )
-"""The most distinctive first: what `recon capture` wrote is listed in a file, and may look like
-others."""
+"""The most distinctive first: what `recon capture` wrote has a list, and may look like others."""
 _NAMELESS: Final = frozenset({"kitti", "kitti-raw", "middlebury"})  # their layouts name the cameras
 
 

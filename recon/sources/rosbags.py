@@ -140,7 +140,21 @@ class Bag:
         for _, recorded_ns, content in self._messages([topic]):
             message = self._parse(content, topic)
             for part in getattr(message, "transforms", [message]):
-                yield _pose_of(part, recorded_ns)
+                if hasattr(part, "transform"):
+                    place, turn = part.transform.translation, part.transform.rotation
+                else:
+                    pose = getattr(part.pose, "pose", part.pose)  # wrapped beside a covariance
+                    place, turn = pose.position, pose.orientation
+                stamp = part.header.stamp
+                yield BagPose(
+                    recorded_ns,
+                    int(stamp.sec) * _NS_PER_S + int(stamp.nanosec),
+                    # Old recordings write frames with a leading slash.
+                    str(part.header.frame_id).lstrip("/"),
+                    str(getattr(part, "child_frame_id", "")).lstrip("/"),
+                    np.array([place.x, place.y, place.z], dtype=np.float64),
+                    np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64),
+                )
 
     def imu(self, topic: str) -> Float64:
         """Return rows (N, 8): times [ns] of recording and of the header, rates, forces."""
@@ -239,22 +253,3 @@ def _decode(message: Any, where: str) -> UInt8:
     shape, big_endian = (message.height, message.width), bool(message.is_bigendian)
     how = message.encoding, shape, message.step
     return pixels_of_ros_image(message.data, *how, big_endian=big_endian, where=where)
-
-
-def _pose_of(message: Any, recorded_ns: int) -> BagPose:
-    """Return the pose in a message; one with a covariance is wrapped once more."""
-    if hasattr(message, "transform"):
-        place, turn = message.transform.translation, message.transform.rotation
-    else:
-        pose = getattr(message.pose, "pose", message.pose)
-        place, turn = pose.position, pose.orientation
-    stamp = message.header.stamp
-    return BagPose(
-        recorded_ns,
-        int(stamp.sec) * _NS_PER_S + int(stamp.nanosec),
-        # Old recordings write frames with a leading slash.
-        str(message.header.frame_id).lstrip("/"),
-        str(getattr(message, "child_frame_id", "")).lstrip("/"),
-        np.array([place.x, place.y, place.z], dtype=np.float64),
-        np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64),
-    )

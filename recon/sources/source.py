@@ -13,14 +13,7 @@ from typing import Any, Final, TypeVar
 
 from recon.core.errors import SourceError
 from recon.core.text import counted, is_count
-from recon.core.values import (
-    ImuRecord,
-    OccupancyTruth,
-    Recorded,
-    Rig,
-    SequenceTruth,
-    Trajectory,
-)
+from recon.core.values import ImuRecord, OccupancyTruth, Recorded, Rig, SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
 from recon.io.files import fingerprint
 from recon.io.trajectory import read_tum
@@ -39,7 +32,7 @@ class StereoSource(ABC):
     """An ordered sequence of stereo pairs from one rig, read lazily.
 
     The base of every source, also of those of users: a subclass has a `calibration`, ``len()`` and
-    `frames`; the rest has defaults. What is a property here may be a plain attribute there.
+    `frames`; what is a property here may be a plain attribute there.
     """
 
     live: bool = False
@@ -95,12 +88,8 @@ class StereoSource(ABC):
     def frames(self, start: int = 0) -> Iterator[Recorded]:
         """Yield the pairs in order, one in memory at a time, from pair ``start`` on.
 
-        Earlier pairs are skipped as cheaply as the input allows: image files are not read, a bag
-        is entered by its index, a video is decoded up to there.
-
-        Raises:
-            FormatError: An image is missing or truncated.
-            CalibrationError: An image has another size than the calibration.
+        Earlier pairs are skipped as cheaply as the input allows. A damaged image is a
+        `FormatError`, one of another size than the calibration a `CalibrationError`.
         """
 
     def __iter__(self) -> Iterator[Recorded]:
@@ -140,11 +129,7 @@ class StereoSource(ABC):
         return ReadPrior(read_tum(name), name)
 
     def read_imu(self) -> ImuRecord | None:
-        """Read what the inertial unit of the rig measured; None = the source has none.
-
-        Raises:
-            ReconError: There is one, but its file cannot be used.
-        """
+        """Read the inertial unit of the rig; None = there is none, `ReconError`: it is damaged."""
         return None
 
     def occupancy_truth(
@@ -333,19 +318,15 @@ class FrameList:
         One line per pair fits at once, whether of all pairs or of those used. Else names that are
         counters give the line, so that it stays right where images are missing, or the position.
         """
-        of_pairs = self._lines_of_all(count)
-        if of_pairs is None:
-            return list(range(count)) if count == len(self.kept) else None
-        return self.used(of_pairs)
-
-    def _lines_of_all(self, count: int) -> list[int] | None:
         if count == len(self.paired):
-            return list(range(count))
+            return self.used(range(count))
         names = (self.names[k] for k in self.paired)
         numbers = [int(name) if is_count(name) else count for name in names]
         if max(numbers) < count:
-            return numbers
-        return list(self.paired) if len(self.names) <= count else None
+            return self.used(numbers)
+        if len(self.names) <= count:
+            return self.used(self.paired)
+        return list(range(count)) if count == len(self.kept) else None
 
 
 def pair_frames(
@@ -354,10 +335,7 @@ def pair_frames(
     where: Path,
     names: Sequence[str] | None = None,
 ) -> tuple[list[tuple[Left, Right]], FrameList]:
-    """Return the pairs that are used, of frames in order with a left and right image (or None).
-
-    ``names`` are those of the frames without suffix.
-    """
+    """Return the pairs that are used of frames with a left and right image, None = missing."""
     alone_right = sum(left is None and right is not None for left, right in frames)
     # A listed frame without any image counts as one, on the left.
     alone_left = sum(right is None for _, right in frames)

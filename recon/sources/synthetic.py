@@ -22,10 +22,7 @@ from recon.street.truth import true_occupancy, true_surface
 
 
 class SyntheticSource(StereoSource):
-    """A rendered drive through a synthetic street, with complete ground truth.
-
-    Surfaces seen up to a depth of ``surface_range_m`` are part of the true surface.
-    """
+    """A rendered drive through a synthetic street, with complete ground truth."""
 
     name: str
     description = "a rendered street"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Final
 
@@ -16,7 +15,7 @@ from recon.core.geometry.se3 import invert
 from recon.core.text import counted, parse_integer, parse_number
 from recon.core.values import SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
-from recon.io.files import read_lines, read_table, read_text, reader
+from recon.io.files import read_lines, read_table, read_text, reader, seconds_of_date
 from recon.io.trajectory import read_tum
 from recon.sources.source import FrameList, check_most
 
@@ -50,20 +49,7 @@ def read_times_of_pairs(path: Path, listing: FrameList) -> Float64:
 def read_dates(path: Path) -> Float64:
     """Read KITTI raw's date and time of day per line: float64 (N,), seconds since 1970."""
     lines = enumerate(read_text(path).splitlines(), start=1)
-    return np.array([_parse_date(s.strip(), f"{path}:{n}") for n, s in lines if s.strip()])
-
-
-def _parse_date(text: str, where: str) -> float:
-    # Python before 3.11 parses at most six decimals.
-    whole, _, fraction = text.partition(".")
-    try:
-        whole.encode("ascii")
-        day = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)
-        return day.timestamp() + parse_number(f"0.{fraction or 0}")
-    except ValueError as error:
-        raise FormatError(
-            "not a time", where=where, got=text[:40], expected="2011-09-26 13:02:25.964389445"
-        ) from error
+    return np.array([seconds_of_date(s, f"{path}:{n}") for n, s in lines if s.strip()])
 
 
 @reader
@@ -72,30 +58,28 @@ def read_stamped_names(path: Path, *, unit_s: float = 1.0) -> list[tuple[float, 
     entries = []
     for number, line in enumerate(read_lines(path), start=1):
         words = line.partition("#")[0].replace(",", " ").split()
-        if words:
-            entries.append(_parse_entry(words, unit_s, f"{path}:{number}"))
+        if not words:
+            continue
+        where, got = f"{path}:{number}", " ".join(words)[:60]
+        try:
+            stamp = parse_number(words[0]) if unit_s == 1 else parse_integer(words[0]) * unit_s
+        except ValueError as error:
+            raise FormatError("not a timestamp", where=where, got=words[0][:40]) from error
+        if len(words) < 2 or not np.isfinite(stamp):
+            raise FormatError("not a timestamp and a file name", where=where, got=got)
+        entries.append((stamp, words[1]))
     if not entries:
         raise FormatError("file lists no images", where=path)
     check_increasing(np.array([stamp for stamp, _ in entries]), str(path))
     return entries
 
 
-def _parse_entry(words: list[str], unit_s: float, where: str) -> tuple[float, str]:
-    try:
-        stamp = parse_number(words[0]) if unit_s == 1 else parse_integer(words[0]) * unit_s
-    except ValueError as error:
-        raise FormatError("not a timestamp", where=where, got=words[0][:40]) from error
-    if len(words) < 2 or not np.isfinite(stamp):
-        raise FormatError("not a timestamp and a file name", where=where, got=" ".join(words)[:60])
-    return stamp, words[1]
-
-
 def truth_at(
     path: Trajectory, stamps_s: Float64, T_body_camera: Float64 | None = None
 ) -> tuple[SequenceTruth | None, str]:
-    """Return the true pose of the left camera at some times; the first one is the identity.
+    """Return the true pose of the left camera at some times, of a path ``T_world_body``.
 
-    The path is ``T_world_body``. If it does not cover all times, there is a note instead.
+    The first pose is the identity. If the path does not cover all times, there is a note instead.
     """
     covered = (stamps_s >= path.timestamps_s[0]) & (stamps_s <= path.timestamps_s[-1])
     if not covered.all():
@@ -166,10 +150,9 @@ def check_seconds(stamps_s: Float64, where: str | Path) -> None:
 def pair_stamps(
     left_s: Float64, right_s: Float64, tolerance_s: float, where: Path
 ) -> list[tuple[int | None, int | None]]:
-    """Return frames in order of time: the indices of left and right image, None = missing.
+    """Pair two increasing series: images that are nearest to each other, within the tolerance.
 
-    Images of two increasing series are a pair if each is the nearest of the other, within the
-    tolerance.
+    Returns frames in order of time: the indices of left and right image, None = missing.
     """
     to_right, to_left = nearest_sorted(left_s, right_s), nearest_sorted(right_s, left_s)
     mutual = to_left[to_right] == np.arange(len(left_s))

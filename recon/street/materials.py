@@ -20,8 +20,6 @@ _OCTAVES: Final = 7
 _ROUGHNESS: Final = 0.92  # amplitude of each octave relative to the next coarser one
 ROAD_HALF_M: Final = 5.2
 _LANE_HALF_M = 3.05
-
-
 #: Of each grain: coarsest wavelength in metres, strength in the exponent of the brightness.
 GRAIN: Final = {
     Material.PLAIN: (0.6, 0.5), Material.ASPHALT: (0.6, 0.5), Material.PAVING: (0.8, 0.4),

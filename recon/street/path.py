@@ -100,20 +100,18 @@ def lap(length_m: float, width_m: float, corner_m: float) -> CentreLine:
 def camera_poses(settings: StreetScene, road: CentreLine) -> Float64:
     """Return ``T_street_camera`` (frames, 4, 4) of the left camera, street axes."""
     along = settings.speed_m_per_frame * np.arange(settings.frames)
-    return np.stack([_camera_pose(float(s), settings, road) for s in along])
-
-
-def _camera_pose(along_m: float, settings: StreetScene, road: CentreLine) -> Float64:
-    """Return position of the car on the road, its small motions, and the mounting of the rig."""
-    phase = 0.7 * (settings.seed % 997)
-    drift = 0.2 * settings.sway * math.sin(along_m / 11.0 + phase)
-    slope = 0.2 * settings.sway / 11.0 * math.cos(along_m / 11.0 + phase)
-    nod = math.radians(0.25) * settings.sway * math.sin(along_m / 3.1 + phase)
-    tilt = math.radians(0.15) * settings.sway * math.sin(along_m / 4.3 + 2.0 * phase)
-    heave = 0.015 * settings.sway * math.sin(along_m / 2.7 + 3.0 * phase)
-    T = road.place(along_m, LANE_M + drift, settings.camera_height_m + heave)
-    R = T[:3, :3] @ se3.exp_so3(np.array([0.0, 0.0, math.atan(slope)])) @ R_STREET_LEVEL
+    sway, phase, poses = settings.sway, 0.7 * (settings.seed % 997), []
     yaw, pitch, roll = np.radians([settings.yaw_deg, settings.pitch_deg, settings.roll_deg])
-    for turn in ((0.0, yaw, 0.0), (-pitch - nod, 0.0, 0.0), (0.0, 0.0, roll + tilt)):
-        R = R @ se3.exp_so3(np.array(turn))
-    return se3.make_transform(R, T[:3, 3])
+    for s in along.tolist():
+        # The position of the car on the road, its small motions, and the mounting of the rig.
+        drift = 0.2 * sway * math.sin(s / 11.0 + phase)
+        slope = 0.2 * sway / 11.0 * math.cos(s / 11.0 + phase)
+        nod = math.radians(0.25) * sway * math.sin(s / 3.1 + phase)
+        tilt = math.radians(0.15) * sway * math.sin(s / 4.3 + 2.0 * phase)
+        heave = 0.015 * sway * math.sin(s / 2.7 + 3.0 * phase)
+        T = road.place(s, LANE_M + drift, settings.camera_height_m + heave)
+        R = T[:3, :3] @ se3.exp_so3(np.array([0.0, 0.0, math.atan(slope)])) @ R_STREET_LEVEL
+        for turn in ((0.0, yaw, 0.0), (-pitch - nod, 0.0, 0.0), (0.0, 0.0, roll + tilt)):
+            R = R @ se3.exp_so3(np.array(turn))
+        poses.append(se3.make_transform(R, T[:3, 3]))
+    return np.stack(poses)

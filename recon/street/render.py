@@ -92,10 +92,7 @@ class StreetCamera:
         return StereoPair(left, right, timestamp_s=time_s, index=index, name=f"{index:06d}")
 
     def depth(self, index: int, *, in_mirrors: bool = True) -> Float32:
-        """Return float32 (H, W), true depth of the left image in metres; NaN = sky.
-
-        What is in a mirror is as far as the cameras see it, or the mirror itself is taken.
-        """
+        """Return float32 (H, W), true depth of the left image, of what mirrors show; NaN = sky."""
         view = self.views(index)[0]
         directions = view.directions(view.pixels())
         depth = self.stage.depth(view.origin, directions, in_mirrors=in_mirrors)
@@ -292,10 +289,7 @@ class Stage:
     seed: int  # of grain and clouds
 
     def depth(self, origin: Float64, directions: Float64, *, in_mirrors: bool = True) -> Float64:
-        """Return float64 (N,), depth along rays of unit depth; NaN where they hit nothing.
-
-        What is in a mirror is as far as both cameras see it, unless the mirror itself is asked for.
-        """
+        """Return float64 (N,), depth along rays of unit depth, of what mirrors show; NaN = sky."""
         depth = np.full(len(directions), np.nan)
         for sight in self._sights(origin, directions, _BOUNCES if in_mirrors else 0):
             hit = sight.faces >= 0
@@ -312,16 +306,11 @@ class Stage:
     def _sights(
         self, origin: Float64, directions: Float64, bounces: int, beyond: Sight | None = None
     ) -> Iterator[Sight]:
-        """Yield rays by the point from which they seem to come: the eye, or its mirror images.
-
-        They go on where those of a mirror, ``beyond``, end.
-        """
-        start = (
-            origin
-            if beyond is None
-            else origin + directions * self._along(beyond)[:, None] / _SIGHT
-        )
-        rays = np.arange(len(directions)) if beyond is None else beyond.rays
+        """Yield rays by the point from which they seem to come: the eye, or its mirror images."""
+        # They go on where those of a mirror, ``beyond``, end.
+        start, rays = origin, np.arange(len(directions))
+        if beyond is not None:
+            start, rays = origin + directions * self._along(beyond)[:, None] / _SIGHT, beyond.rays
         seen = Sight(rays, origin, directions, self.rays.first_hit(start, directions))
         mirror = (seen.faces >= 0) & (self.soup.material[seen.faces] == Material.MIRROR)
         if not bounces:

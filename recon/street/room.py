@@ -15,8 +15,8 @@ import numpy as np
 
 from recon.core.geometry import se3
 from recon.core.values.arrays import Float64
-from recon.street.buildings import draw_plan, house, wall_with_holes
 from recon.street.path import R_STREET_LEVEL, CentreLine, lap
+from recon.street.props import draw_plan, house, wall_with_holes
 from recon.street.settings import StreetScene
 from recon.street.shapes import Material, Paint, TriangleSoup, at, boxes, merge, move, quads
 
@@ -25,6 +25,8 @@ _MARGIN_M: Final = 1.4  # between the path and the walls
 _CORNER_M: Final = 1.0  # radius of the path in the corners
 _OUTSIDE_M: Final = (12.0, 40.0)  # distance of the houses that the windows show
 _WHITE: Final = Paint(Material.WHITE, (0.9, 0.89, 0.87))
+_FRAME: Final = Paint(Material.PLAIN, (0.45, 0.36, 0.28), 5)
+_GRASS: Final = Paint(Material.GRASS, (0.33, 0.38, 0.20), 6)
 _WOODS: Final = [(0.55, 0.40, 0.26), (0.36, 0.24, 0.15), (0.72, 0.62, 0.48), (0.82, 0.80, 0.77)]
 _PAPERS: Final = [
     Paint(Material.PLASTER, (0.62, 0.68, 0.60)),
@@ -52,21 +54,20 @@ def hand_poses(settings: StreetScene, road: CentreLine) -> Float64:
     rng = np.random.default_rng([settings.seed, 71])
     phases = rng.uniform(0.0, 2.0 * np.pi, (len(_SHAKES) + 1, 6))
     along = settings.speed_m_per_frame * np.arange(settings.frames)
-    return np.stack([_hand_pose(float(s), settings, road, phases) for s in along])
-
-
-def _hand_pose(along_m: float, settings: StreetScene, road: CentreLine, phases: Float64) -> Float64:
-    off = np.zeros(6)
-    for (wave_m, shift_m, turn_deg), phase in zip(_SHAKES, phases, strict=False):
-        size = np.repeat([shift_m, math.radians(turn_deg)], 3)
-        off += settings.sway * size * np.sin(2.0 * np.pi * along_m / wave_m + phase)
-    look = math.radians(_LOOK[1]) * math.sin(2.0 * np.pi * along_m / _LOOK[0] + phases[-1, 0])
     yaw, pitch, roll = np.radians([settings.yaw_deg, -settings.pitch_deg, settings.roll_deg])
-    T = road.place(along_m, 0.0, settings.camera_height_m)
-    R = T[:3, :3] @ R_STREET_LEVEL
-    for turn in ((0.0, yaw + look, 0.0), (pitch, 0.0, 0.0), (0.0, 0.0, roll), off[3:]):
-        R = R @ se3.exp_so3(np.array(turn))
-    return se3.make_transform(R, T[:3, 3] + off[:3])
+    poses = []
+    for s in along.tolist():
+        off = np.zeros(6)
+        for (wave_m, shift_m, turn_deg), phase in zip(_SHAKES, phases, strict=False):
+            size = np.repeat([shift_m, math.radians(turn_deg)], 3)
+            off += settings.sway * size * np.sin(2.0 * np.pi * s / wave_m + phase)
+        look = math.radians(_LOOK[1]) * math.sin(2.0 * np.pi * s / _LOOK[0] + phases[-1, 0])
+        T = road.place(s, 0.0, settings.camera_height_m)
+        R = T[:3, :3] @ R_STREET_LEVEL
+        for turn in ((0.0, yaw + look, 0.0), (pitch, 0.0, 0.0), (0.0, 0.0, roll), off[3:]):
+            R = R @ se3.exp_so3(np.array(turn))
+        poses.append(se3.make_transform(R, T[:3, 3] + off[:3]))
+    return np.stack(poses)
 
 
 def furnished_room(settings: StreetScene, road: CentreLine) -> TriangleSoup:
@@ -82,7 +83,7 @@ def furnished_room(settings: StreetScene, road: CentreLine) -> TriangleSoup:
         quads([*low, 0.0], x, y, floor),
         quads([*low, _HEIGHT_M], x, y, replace(_WHITE, part=4)),
         move(island, at(middle_x, middle_y, 0.0, float(rng.uniform(0.0, 3.0)))),
-        quads([-80.0, -80.0, -3.0], [160.0, 0.0, 0.0], [0.0, 160.0, 0.0], _grass()),
+        quads([-80.0, -80.0, -3.0], [160.0, 0.0, 0.0], [0.0, 160.0, 0.0], _GRASS),
     ]
     things = list(rng.permutation(_THINGS))
     corners = ((high[0], high[1]), (low[0], high[1]), (low[0], low[1]), (high[0], low[1]))
@@ -107,7 +108,10 @@ def _wall(
         if thing == "window":
             holes.append((along, 0.9, along + room, 2.2))
             yield _window(along, room)
-            yield _outside(along + 0.5 * room, rng)
+            # A house at some distance from the window.
+            width, away = float(rng.uniform(9.0, 14.0)), float(rng.uniform(*_OUTSIDE_M))
+            aside = along + 0.5 * room - 0.5 * width + float(rng.uniform(-0.2, 0.2)) * away
+            yield move(house(draw_plan(width, rng), rng), at(aside, away, -3.0))
         else:
             yield from (move(part, at(along, 0.0, 0.0)) for part in _standing(thing, room, rng))
         along += room + float(rng.uniform(0.05, 0.6))
@@ -147,7 +151,7 @@ def _framed(width_m: float, low_m: float, high_m: float, paint: Paint) -> Triang
 def _window(along_m: float, width_m: float) -> TriangleSoup:
     """Return the frame of a window, which has no glass."""
     middle = along_m + 0.5 * width_m
-    cross = boxes([middle - 0.03, 0.0, 0.9], [middle + 0.03, 0.06, 2.2], _frame())
+    cross = boxes([middle - 0.03, 0.0, 0.9], [middle + 0.03, 0.06, 2.2], _FRAME)
     return merge([_bars(along_m, along_m + width_m, 0.9, 2.2, -0.04), cross])
 
 
@@ -158,14 +162,7 @@ def _bars(left: float, right: float, low: float, high: float, out: float) -> Tri
     ])  # fmt: skip
     near, far = np.full(4, out), np.full(4, 0.03)
     x0, z0, x1, z1 = ends.T
-    return boxes(np.column_stack([x0, near, z0]), np.column_stack([x1, far, z1]), _frame())
-
-
-def _outside(along_m: float, rng: np.random.Generator) -> TriangleSoup:
-    """Return a house at some distance from a window."""
-    width, away = float(rng.uniform(9.0, 14.0)), float(rng.uniform(*_OUTSIDE_M))
-    aside = along_m - 0.5 * width + float(rng.uniform(-0.2, 0.2)) * away
-    return move(house(draw_plan(width, rng), rng), at(aside, away, -3.0))
+    return boxes(np.column_stack([x0, near, z0]), np.column_stack([x1, far, z1]), _FRAME)
 
 
 def _table(width_m: float, depth_m: float, rng: np.random.Generator) -> TriangleSoup:
@@ -210,11 +207,3 @@ def _coloured(low: Float64, high: Float64, rng: np.random.Generator) -> Triangle
 
 def _wood(rng: np.random.Generator) -> Paint:
     return Paint(Material.PLAIN, _WOODS[int(rng.integers(len(_WOODS)))], int(rng.integers(2**30)))
-
-
-def _frame() -> Paint:
-    return Paint(Material.PLAIN, (0.45, 0.36, 0.28), 5)
-
-
-def _grass() -> Paint:
-    return Paint(Material.GRASS, (0.33, 0.38, 0.20), 6)

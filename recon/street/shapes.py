@@ -46,10 +46,7 @@ def boxes(low: Any, high: Any, paint: Paint) -> TriangleSoup:
 
 
 def frustum(low: Any, high: Any, inset: tuple[float, float, float], paint: Paint) -> TriangleSoup:
-    """Return the four walls of a box that narrows towards the top.
-
-    ``inset`` is that of the top at the back (-x), at the front (+x) and at each side.
-    """
+    """Return the walls of a box whose top is narrower by ``inset``: at -x, +x and each side."""
     (x0, y0, z0), (x1, y1, z1), (back, front, side) = low, high, inset
 
     def rim(x0: float, x1: float, y0: float, y1: float, z: float) -> Float64:
@@ -126,13 +123,7 @@ def bumpy_ball(radii_m: Any, paint: Paint, *, bump: float, wavelength: float) ->
 
 @cache
 def _icosphere_corners(splits: int) -> tuple[Float64, NDArray[np.int64]]:
-    """Return the different corners (N, 3) of a unit sphere, and which its faces have."""
-    flat, places = np.unique(icosphere(splits).reshape(-1, 3), axis=0, return_inverse=True)
-    return flat, places.ravel()
-
-
-def icosphere(splits: int) -> Float64:
-    """Return triangles (20·4^splits, 3, 3) of a unit sphere."""
+    """Return corners (N, 3) of a unit sphere of 20·4^splits triangles, and which those have."""
     g = (1.0 + 5.0**0.5) / 2.0
     flat = np.array([[-1, g, 0], [1, g, 0], [-1, -g, 0], [1, -g, 0]])
     # Three golden rectangles, one in each coordinate plane.
@@ -147,7 +138,8 @@ def icosphere(splits: int) -> Float64:
         ab, bc, ca = _unit(a + b), _unit(b + c), _unit(c + a)
         children = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
         corners = np.concatenate([np.stack(child, axis=1) for child in children])
-    return corners
+    flat, places = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    return flat, places.ravel()
 
 
 def _unit(v: NDArray[Any]) -> Float64:
@@ -215,10 +207,7 @@ def at(x: float, y: float, z: float, turn_rad: float = 0.0) -> Float64:
 def painted(
     vertices: Float64, uv: Float64, paint: Paint, normals: Float64 | None = None
 ) -> TriangleSoup:
-    """Return triangles (F, 3, 3) with texture coordinates (F, 3, 2), all in one paint.
-
-    Without ``normals`` they are flat-shaded.
-    """
+    """Return triangles (F, 3, 3) in one paint, flat-shaded unless there are ``normals``."""
     n = len(vertices)
     if normals is None:
         flat = np.cross(vertices[:, 1] - vertices[:, 0], vertices[:, 2] - vertices[:, 0])

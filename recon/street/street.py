@@ -14,10 +14,9 @@ from recon.core.geometry import se3
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64, freeze
 from recon.street import props
-from recon.street.buildings import draw_plan, house
 from recon.street.materials import ROAD_HALF_M
 from recon.street.path import BEHIND_M, CentreLine, camera_poses, centre_line
-from recon.street.props import SECTION_M, SECTIONS
+from recon.street.props import SECTION_M, SECTIONS, draw_plan, house
 from recon.street.room import furnished_room, hand_poses, room_lap
 from recon.street.settings import StreetScene, StreetSettings
 from recon.street.shapes import Material, Paint, TriangleSoup, at, band, merge, move, painted

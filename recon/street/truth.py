@@ -12,7 +12,7 @@ from recon.core.geometry import se3
 from recon.core.kernels.voxels import distinct_keys, pack_keys, unpack_keys
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import FREE, OCCUPIED, OccupancyGrid, OccupancyTruth, PointCloud
-from recon.core.values.arrays import Bool, Float32, Float64, Int32
+from recon.core.values.arrays import Float32, Float64, Int32
 from recon.street.render import StreetCamera
 from recon.street.street import StreetWorld
 
@@ -68,7 +68,15 @@ def true_occupancy(
         seen.add(cells[away <= range_m + _BEYOND_M], frames=0)
         columns.add(cells[near & low] * [1, 1, 0])
     keys, frames = seen.counts()
-    corner, known = _raster(*columns.counts(), least_frames)
+    # The smallest raster of the columns, and which were seen enough.
+    places, times = columns.counts()
+    if len(places) == 0:
+        raise EvaluationError("no surface of the street is in view and in range")
+    corner = places[:, :2].min(axis=0)
+    width, height = (places[:, :2].max(axis=0) - corner + 1).tolist()
+    known = np.zeros((height, width), dtype=np.bool_)
+    enough = places[times >= least_frames, :2] - corner
+    known[enough[:, 1], enough[:, 0]] = True
     return OccupancyTruth(
         grid=_footprint(world, T @ world.T_world_street, band_m, corner, known.shape, resolution_m),
         seen=known,
@@ -79,18 +87,6 @@ def true_occupancy(
         range_m=range_m,
         least_frames=least_frames,
     )
-
-
-def _raster(columns: Int32, frames: NDArray[np.int64], least: int) -> tuple[Int32, Bool]:
-    """Return the corner of the smallest raster of columns (N, 3), and which were seen enough."""
-    if len(columns) == 0:
-        raise EvaluationError("no surface of the street is in view and in range")
-    corner = columns[:, :2].min(axis=0)
-    width, height = (columns[:, :2].max(axis=0) - corner + 1).tolist()
-    known = np.zeros((height, width), dtype=np.bool_)
-    enough = columns[frames >= least, :2] - corner
-    known[enough[:, 1], enough[:, 0]] = True
-    return corner, known
 
 
 def _visible_points(camera: StreetCamera, index: int, range_m: float) -> Float64:
@@ -133,10 +129,7 @@ def _footprint(
     shape: tuple[int, ...],
     resolution_m: float,
 ) -> OccupancyGrid:
-    """Return OCCUPIED where a surface lies in the height band, else FREE.
-
-    ``low`` is the first column and row. Objects taller than the band, such as houses, are hollow.
-    """
+    """Return OCCUPIED where a surface lies in the height band, else FREE."""
     rows, columns = shape
     origin = (float(low[0] * resolution_m), float(low[1] * resolution_m))
     vertices = se3.apply(T_map_street, world.soup.vertices.reshape(-1, 3)).reshape(-1, 3, 3)
@@ -166,28 +159,22 @@ def _outlines(vertices: Float64, band_m: tuple[float, float], step_m: float) -> 
     """Return points (N, 3) every ``step_m`` along horizontal cuts through triangles in a band."""
     levels = np.arange(band_m[0], band_m[1] + 1e-9, _SLICE_M)
     lowest, highest = vertices[..., 2].min(axis=1), vertices[..., 2].max(axis=1)
-    cuts = [_level_cut(vertices[(lowest < z) & (highest > z)], z) for z in levels]
-    return np.concatenate([_sample_segments(*ends, step_m) for ends in cuts])
-
-
-def _level_cut(triangles: Float64, z: float) -> tuple[Float64, Float64]:
-    """Return ends (N, 3) of the segments in which triangles cross the plane at height ``z``."""
-    above = triangles[..., 2] > z
-    # The corner that is alone on its side of the plane; both edges from it cross the plane.
-    lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
-    row = np.arange(len(triangles))
-    apex = triangles[row, lone]
-    ends = []
-    for step in (1, 2):
-        other = triangles[row, (lone + step) % 3]
-        ratio = (z - apex[:, 2]) / (other[:, 2] - apex[:, 2])
-        ends.append(apex + ratio[:, None] * (other - apex))
-    return ends[0], ends[1]
-
-
-def _sample_segments(start: Float64, end: Float64, step_m: float) -> Float64:
-    pieces = np.ceil(np.linalg.norm(end - start, axis=1) / step_m).astype(int) + 1
-    segment = np.repeat(np.arange(len(start)), pieces + 1)
-    first = np.cumsum(pieces + 1) - (pieces + 1)
-    ratio = (np.arange(len(segment)) - first[segment]) / pieces[segment]
-    return np.asarray(start[segment] + ratio[:, None] * (end - start)[segment])
+    points = []
+    for z in levels:
+        triangles = vertices[(lowest < z) & (highest > z)]
+        above = triangles[..., 2] > z
+        # The corner that is alone on its side of the plane; both edges from it cross the plane.
+        lone = np.where(above.sum(axis=1) == 1, above.argmax(axis=1), (~above).argmax(axis=1))
+        row = np.arange(len(triangles))
+        apex, ends = triangles[row, lone], []
+        for step in (1, 2):
+            other = triangles[row, (lone + step) % 3]
+            along = (z - apex[:, 2]) / (other[:, 2] - apex[:, 2])
+            ends.append(apex + along[:, None] * (other - apex))
+        start, end = ends
+        pieces = np.ceil(np.linalg.norm(end - start, axis=1) / step_m).astype(int) + 1
+        segment = np.repeat(np.arange(len(start)), pieces + 1)
+        first = np.cumsum(pieces + 1) - (pieces + 1)
+        along = (np.arange(len(segment)) - first[segment]) / pieces[segment]
+        points.append(start[segment] + along[:, None] * (end - start)[segment])
+    return np.concatenate(points)

@@ -20,14 +20,13 @@ from recon.core.errors import CalibrationError, OutputError, ReconError, SourceE
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.core.values.board import parse_board
 from recon.io import atomic
-from recon.io.cameras.calibration import read_calibration
-from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.cameras.calibration import read_calibration, write_recon_calibration
 from recon.io.images.image import read_image, write_image
 from recon.io.trajectory import FRAMES, HEADER
 from recon.rig import capture
 from recon.rig.calibrate.board_views import find_views
-from recon.rig.calibrate.result import CalibrationResult, write_calibration
-from recon.sources.image_names import pair_images
+from recon.rig.calibrate.verdict import CalibrationResult, write_calibration
+from recon.sources.images import pair_images
 from recon.sources.registry import open_source
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.rectify.rectifier import Rectifier

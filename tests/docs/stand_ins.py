@@ -18,7 +18,7 @@ from recon.commands.map_options import MapOptions
 from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import PointCloud, Trajectory
 from recon.core.values.board import parse_board
-from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.cameras.calibration import write_recon_calibration
 from recon.io.images.disparity import write_pfm
 from recon.io.images.image import write_image
 from recon.io.models.ply import write_ply

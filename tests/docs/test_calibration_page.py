@@ -5,8 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from recon.io.cameras.calibration import read_calibration
-from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.cameras.calibration import read_calibration, write_recon_calibration
 from tests.docs.blocks import ROOT, blocks_of
 
 FILES = [

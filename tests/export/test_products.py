@@ -18,8 +18,8 @@ from recon.export.costmap import make_costmap
 from recon.export.make import Products, make
 from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext
-from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply, write_ply_tiles
+from recon.io.models.rasters import read_grid
 from recon.map.drive import mapper
 from recon.map.drive.sequence import MappedSequence, map_sequence
 from recon.map.ground.axes import map_axes

@@ -16,7 +16,7 @@ from recon.export.mesh.cut import vertex_normals
 from recon.export.mesh.texture import PosedImage, textured_mesh
 from recon.export.product import DriveImages
 from recon.io.images.image import write_image
-from recon.io.models.mlp import Photo, write_mlp
+from recon.io.models.mesh import Photo, write_mlp
 
 CAMERA = RectifiedCamera(
     focal_px=200.0, cx_px=159.5, cy_px=119.5, cx_right_px=159.5, baseline_m=0.1,

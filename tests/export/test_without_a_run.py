@@ -10,7 +10,7 @@ import recon
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError, SourceError
 from recon.export.make import PRODUCTS, make
 from recon.export.product import ExportContext
-from recon.io.models import nav2
+from recon.io.models import rasters
 from recon.io.models.octomap import read_octomap
 from tests.map import walls
 
@@ -167,7 +167,7 @@ def test_an_error_leaves_what_was_there_and_nothing_beside_it(mapped, tmp_path, 
     def full(*_: object) -> None:
         raise fail
 
-    monkeypatch.setattr(nav2, "write_text", full)
+    monkeypatch.setattr(rasters, "write_text", full)
     with pytest.raises(OutputError, match=r"a\.yaml.*No space left"):
         recon.export_map(mapped, "grid", tmp_path / "a.yaml")
     assert files_in(tmp_path) == {"a.yaml": b"old"}

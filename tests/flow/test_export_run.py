@@ -24,9 +24,9 @@ from recon.core.errors import EvaluationError, FormatError, ReconError, Settings
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair
 from recon.io.models.mesh import read_mesh
-from recon.io.models.nav2 import read_grid
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
+from recon.io.models.rasters import read_grid
 from recon.io.trajectory import read_tum
 from recon.map.store.records import Store
 from recon.report.style import GRID_ERRORS, GRID_NOT_COUNTED

@@ -21,8 +21,13 @@ from recon.io.trajectory import read_tum
 from recon.map.drive.drive import MapBehind
 from recon.map.drive.mapper import FrameResult
 from recon.map.map import Map
-from recon.rig.cameras import CameraSource, is_camera, open_camera_source
-from recon.rig.capture import CaptureSettings, RecordingSettings
+from recon.rig.capture import (
+    CameraSource,
+    CaptureSettings,
+    RecordingSettings,
+    is_camera,
+    open_camera_source,
+)
 from recon.sources import live
 from recon.sources.live import LiveSource
 from recon.sources.settings import SourceSettings

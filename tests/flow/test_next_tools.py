@@ -25,8 +25,8 @@ from recon.core.values.camera import unproject
 from recon.export import nerfstudio
 from recon.io.images.image import read_image, read_levels
 from recon.io.models.mesh import read_mesh
-from recon.io.models.nav2 import read_grid
 from recon.io.models.ply import read_ply
+from recon.io.models.rasters import read_grid
 from recon.io.trajectory import read_tum
 from recon.map.map import Map
 from recon.map.store.session import SESSION

@@ -21,14 +21,14 @@ from recon.io.cameras.ros import read_euroc_camera, read_euroc_truth
 from recon.io.fields import read_yaml
 from recon.io.images.disparity import read_disparity_png, read_pfm, write_pfm
 from recon.io.images.image import read_image
-from recon.io.images.video import open_video
 from recon.io.models.mesh import read_mesh, write_mesh
-from recon.io.models.nav2 import read_grid, write_nav2
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply, write_ply
+from recon.io.models.rasters import read_grid, write_nav2
 from recon.io.trajectory import read_frames, read_trajectory
 from recon.sources.registry import open_source
 from recon.sources.times import read_dates, read_stamped_names
+from recon.sources.video import open_video
 from tests.hostile.calibrations import CAMERA_INFO, VALID
 from tests.hostile.refusals import refusal
 from tests.hostile.test_map_records import read_map, write_map

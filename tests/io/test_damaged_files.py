@@ -11,10 +11,9 @@ import pytest
 from recon.core.errors import CalibrationError, FormatError, ReconError, ShapeError
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import FREE, CameraIntrinsics, OccupancyGrid, StereoCalibration
-from recon.io.cameras.calibration import read_calibration
+from recon.io.cameras.calibration import read_calibration, write_recon_calibration
 from recon.io.cameras.kitti import read_kitti_calib
 from recon.io.cameras.opencv_yaml import read_file_storage
-from recon.io.cameras.recon_yaml import write_recon_calibration
 from recon.io.cameras.ros import read_euroc_truth, write_kalibr
 from recon.io.fields import read_toml, read_yaml
 from recon.io.files import read_table, read_text
@@ -22,9 +21,9 @@ from recon.io.images.disparity import read_pfm
 from recon.io.images.image import read_image
 from recon.io.middlebury import read_middlebury_calib
 from recon.io.models.mesh import read_mesh
-from recon.io.models.nav2 import read_grid, write_nav2
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
+from recon.io.models.rasters import read_grid, write_nav2
 from recon.io.trajectory import read_frames, read_trajectory
 
 IDENTITY = b"1 0 0 0 0 1 0 0 0 0 1 0\n"

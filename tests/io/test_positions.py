@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import ReconError
-from recon.io.control_points import is_control, read_control
-from recon.io.positions import Positions, read_positions
+from recon.io.positions import Positions, is_control, read_control, read_positions
 from tests.scenery import receivers
 
 pytest.importorskip("pyproj")

@@ -8,11 +8,10 @@ from hypothesis import strategies as st
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import Trajectory
-from recon.io.control_points import read_control
 from recon.io.fields import read_yaml, write_yaml
 from recon.io.files import read_table, read_text
 from recon.io.imu import read_imu
-from recon.io.positions import read_positions
+from recon.io.positions import read_control, read_positions
 from recon.io.trajectory import (
     holds_times,
     read_kitti_poses,

@@ -11,7 +11,7 @@ import recon
 from recon.core.errors import CalibrationError, FormatError, OutputError
 from recon.core.geometry.se3 import invert
 from recon.core.values import FREE, OCCUPIED, UNKNOWN
-from recon.io.models.nav2 import write_nav2, write_nav2_costs
+from recon.io.models.rasters import write_nav2, write_nav2_costs
 from recon.io.trajectory import reordered, write_tum
 from tests.io.cameras.test_calibrations import rig
 from tests.io.test_trajectory_files import STANDING, carried, crabbing, drive

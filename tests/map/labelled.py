@@ -55,9 +55,8 @@ def main(folder: Path) -> None:
 
     from recon.commands.config import load_config
     from recon.core.values import join_clouds
+    from recon.io.models.columns import write_npz, write_pcd
     from recon.io.models.las import write_las
-    from recon.io.models.npz import write_npz
-    from recon.io.models.pcd import write_pcd
     from recon.io.models.ply import read_ply, write_ply
     from recon.io.models.ros_bag import header, points
     from recon.map.map import Map

@@ -19,7 +19,7 @@ from recon.core.values import (
     TrajectoryMetrics,
     TriangleMesh,
 )
-from recon.evaluation.map_comparison import DriveErrors
+from recon.evaluation.map import DriveErrors
 from recon.look.fault import NAMES, RigFault
 from recon.look.fit import FittedFault
 from recon.look.rig import DEPTHS_M, RefinedRig, RigChange

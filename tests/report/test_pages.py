@@ -20,7 +20,7 @@ from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from recon.core.values import DisparityMetrics, DisparityTruth, PointCloud, Reason, Trajectory
-from recon.evaluation.map_comparison import DriveErrors
+from recon.evaluation.map import DriveErrors
 from recon.odometry.protocol import OdometryHealth
 from recon.report.map_page import map_content, write_joined_page
 from recon.report.page import command_line, page_environment, render_page, summary_rows, write_page

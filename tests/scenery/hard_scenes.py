@@ -13,9 +13,9 @@ import numpy as np
 from recon.core.geometry import se3
 from recon.core.values.arrays import Float64
 from recon.street import props
-from recon.street.buildings import draw_plan, house, wall_with_holes
 from recon.street.kernels.surface import value_noise
 from recon.street.path import R_STREET_LEVEL
+from recon.street.props import draw_plan, house, wall_with_holes
 from recon.street.shapes import (
     Material,
     Paint,

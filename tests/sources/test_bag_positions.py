@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.core.errors import ReconError
-from recon.sources.bag_positions import read_measured
+from recon.sources.bag import read_measured
 from tests.sources.bags import Recording, recorder
 
 PLACES = np.column_stack([49.0 + 1e-5 * np.arange(8), np.full(8, 8.4), 115 + 0.1 * np.arange(8)])

@@ -11,13 +11,12 @@ from recon.core.errors import ReconError, SourceError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera, StereoCalibration
 from recon.io.cameras.ros import are_rectified
-from recon.io.images.video import VideoFile
 from recon.sources.bag import rig_of_messages
 from recon.sources.registry import open_source
 from recon.sources.rosbags import BagCameraInfo
 from recon.sources.settings import SourceSettings
 from recon.sources.source import StereoSource
-from recon.sources.video import view_size
+from recon.sources.video import VideoFile, view_size
 from tests.sources import drives
 from tests.sources.drives import CAMERA
 

@@ -22,8 +22,7 @@ from recon.io.trajectory import FRAMES as FRAME_LIST
 from recon.io.trajectory import CapturedFrame
 from recon.map.drive.sequence import map_sequence
 from recon.rig.audit import audit_source
-from recon.rig.cameras import open_camera_source
-from recon.rig.capture import CaptureSettings
+from recon.rig.capture import CaptureSettings, open_camera_source
 from recon.sources.registry import open_source, recognise_source
 from recon.sources.settings import SourceSettings
 from recon.sources.source import mark_of

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from recon.core.errors import CalibrationError, FormatError, ReconError, SourceError
 from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration
-from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.cameras.calibration import write_recon_calibration
 from recon.io.cameras.ros import read_euroc_camera, write_kalibr
 from recon.io.images.image import write_image
-from recon.sources.image_names import find_partners, pair_images
+from recon.sources.images import find_partners, pair_images
 from recon.sources.kitti import open_kitti
 from recon.sources.one_pair import read_pair, read_pair_input
 from recon.sources.registry import open_source

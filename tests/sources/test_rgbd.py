@@ -15,15 +15,15 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, RectifiedImage, StereoCalibration
 from recon.core.values.camera import depth_from_disparity, depth_sigma
 from recon.evaluation.trajectory import evaluate_trajectory
-from recon.io.cameras.recon_yaml import write_recon_calibration
+from recon.io.cameras.calibration import write_recon_calibration
 from recon.io.images.image import write_image
 from recon.map.drive.sequence import map_sequence
 from recon.odometry.features import find_in_right
 from recon.odometry.sfm import check_sfm
 from recon.rig.audit import audit_source
 from recon.run.run import Run
+from recon.sources.listed import disparity_of
 from recon.sources.registry import open_source, recognise_source
-from recon.sources.rgbd import disparity_of
 from recon.sources.settings import SourceSettings
 from recon.sources.source import DerivedSource
 from recon.stereo.frame import FrameReconstructor

@@ -107,7 +107,7 @@ def read_result(given: ResultFolder, scene: ScoredScene) -> SceneResult | None:
         return None
     found = unrated(read_pfm(file))
     with naming(file):
-        measured = {"ndisp": None, "confidence": None, "seconds": read_seconds(file)}
+        measured = {"ndisp": None, "confidence": None, "seconds": _seconds_beside(file)}
         return _scored(scene, given.name, found, measured)
 
 
@@ -285,9 +285,8 @@ def find_results(
 ) -> list[ResultFolder]:
     """Find the results of other programs for scenes, one folder for each program.
 
-    A scene's result is ``Teddy.pfm``, or the only ``disp0*.pfm`` in a folder ``Teddy``, as the
-    benchmark's kit names them; the scene's name may be preceded by that of its folder
-    (``trainingQ/Teddy``). No program gets a name that is ``taken``.
+    A scene's result is ``Teddy.pfm``, or the only ``disp0*.pfm`` in a folder ``Teddy``, perhaps in
+    a folder such as ``trainingQ``. No program gets a name that is ``taken``.
     """
     found = []
     for name, folder in zip(_names(folders, taken), folders, strict=True):
@@ -334,7 +333,7 @@ def _submitted(folder: Path) -> Path | None:
     return folder / found[0] if found else None
 
 
-def read_seconds(file: Path) -> float | None:
+def _seconds_beside(file: Path) -> float | None:
     """Return what ``timeX.txt`` beside a result ``disp0X.pfm`` says; None if there is none."""
     beside = file.with_name(f"time{file.stem.removeprefix(_DISPARITY)}.txt")
     if not file.stem.startswith(_DISPARITY) or not beside.is_file():

@@ -170,9 +170,8 @@ def evaluate_middlebury(
 
     Args:
         estimate: A disparity, or its values: (h, w), pixels of its own size, not finite = none.
-            Sparse as matched, or dense (holes filled).
         truth: Ground truth, at the size of the result or 2 or 4 times larger or smaller; or its
-            values as `DisparityTruth.from_values` takes them.
+            values (`DisparityTruth.from_values`).
         rules: Rules of the scene; None = errors in pixels of the truth, nothing clipped, rounded.
         occluded: Whether to include pixels that only the left camera sees ("all").
 

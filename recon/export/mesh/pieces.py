@@ -40,8 +40,7 @@ from recon.export.mesh.poisson import (
 from recon.export.product import ExportContext, ExportResult
 from recon.io.atomic import write_text
 from recon.io.models.las import check_crs
-from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
-from recon.io.models.mlp import write_mlp
+from recon.io.models.mesh import join_meshes, read_mesh, write_mesh, write_mlp
 from recon.map.cut import Rectangle
 from recon.map.occupancy.moving import looked_through
 from recon.map.sessions.placed import has_occupancy

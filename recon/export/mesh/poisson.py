@@ -23,6 +23,7 @@ from recon.export.mesh.cut import drop_small_components, keep_vertices, vertex_n
 from recon.export.pymeshlab import screened_poisson
 from recon.io.models import open3d_meshes
 from recon.map.kernels.distance import surface_of
+from recon.io.models.mesh import decimate
 from recon.stereo import open3d_clouds
 
 OVERLAP_M: Final = 3.0
@@ -159,7 +160,7 @@ def simplified(mesh: TriangleMesh, settings: MeshSettings) -> TriangleMesh:
     """Return a mesh with about as many faces as the settings allow, if it has more."""
     if settings.target_faces is None or len(mesh.faces) <= settings.target_faces:
         return mesh
-    vertices, faces = open3d_meshes.decimate(mesh.vertices, mesh.faces, settings.target_faces)
+    vertices, faces = decimate(mesh.vertices, mesh.faces, settings.target_faces)
     rgb = None if mesh.rgb is None else mesh.rgb[_nearest(vertices, mesh.vertices)]
     return TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)
 

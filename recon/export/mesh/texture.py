@@ -36,8 +36,7 @@ from recon.export.mesh.charts import MARGIN_PX, Atlas, make_atlas, ratios_of, te
 from recon.export.mesh.pieces import SAMPLE_FACES, WHOLE, mesh_product, write_surveyed
 from recon.export.product import DriveImages, ExportContext, ExportResult
 from recon.io.images.image import write_image
-from recon.io.models.mesh import read_mesh, write_mesh
-from recon.io.models.mlp import Photo, write_mlp
+from recon.io.models.mesh import Photo, read_mesh, write_mesh, write_mlp
 from recon.map.fusion import fusion_range_m
 from recon.map.sessions.placed import settings_of
 

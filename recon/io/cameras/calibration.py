@@ -1,26 +1,126 @@
-"""Reads any supported calibration file, recognised by its content."""
+"""Calibration files: our own YAML, and those of other programs, recognised by their content."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final, cast
 from zipfile import is_zipfile
 
+import numpy as np
+import yaml
+
 from recon.core.errors import CalibrationError, FormatError
+from recon.core.geometry.se3 import make_transform
 from recon.core.text import parse_number
 from recon.core.values import (
+    CameraIntrinsics,
+    LensModel,
+    RectifiedCamera,
     Rig,
     StereoCalibration,
     check_side_by_side,
     check_size,
 )
+from recon.io.atomic import write_text
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.opencv_yaml import INSTEAD, read_opencv_calibration
-from recon.io.cameras.recon_yaml import MARK, read_recon_calibration, write_recon_calibration
-from recon.io.cameras.ros import in_options, read_camera_info, read_kalibr
+from recon.io.cameras.ros import in_options, pinhole_matrix, read_camera_info, read_kalibr
+from recon.io.fields import Fields, read_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.io.middlebury import read_middlebury_calib
+
+MARK: Final = "recon-calibration"
+_VERSION: Final = 1
+_HEADER: Final = """\
+# Pixel centres are at integers; camera axes: x right, y down, z forward.
+# xyz_right = rotation * xyz_left + translation_m
+"""
+_NAMES: Final[dict[str, tuple[str, ...]]] = {  # of coefficients, by lens model
+    "pinhole": (
+        "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty",
+    ),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}  # fmt: skip
+_RECTIFIED: Final = ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m")
+
+
+def write_recon_calibration(
+    path: StrPath, calibration: Rig, quality: Mapping[str, Any] | None = None
+) -> None:
+    """Write a calibration atomically; figures of its ``quality`` are not read back."""
+    content = {"format": MARK, "version": _VERSION, **_content(calibration)}
+    if quality:
+        content["quality"] = dict(quality)
+    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    write_text(path, _HEADER + text)
+
+
+@reader
+def read_recon_calibration(path: StrPath) -> Rig:
+    """Read what `write_recon_calibration` wrote."""
+    fields = Fields(read_yaml(path))
+    if fields.text("format") != MARK or fields.number("version") != _VERSION:
+        got, expected = f"{fields.get('format')} {fields.get('version')}", f"{MARK} {_VERSION}"
+        what = "version of the calibration file is not supported"
+        raise FormatError(what, got=got, expected=expected)
+    kind = fields.text("kind")
+    if kind == "rectified":
+        camera = fields.below("camera")
+        return RectifiedCamera(
+            **{name: camera.number(name) for name in _RECTIFIED},
+            width_px=camera.count("width_px"),
+            height_px=camera.count("height_px"),
+            ndisp=camera.count("ndisp") if "ndisp" in camera else None,
+        )
+    if kind != "stereo":
+        raise FormatError("unknown kind of calibration", got=kind, expected="stereo or rectified")
+    pose = fields.below("right_from_left")
+    T = make_transform(pose.numbers("rotation", (3, 3)), pose.numbers("translation_m", (3,)))
+    left, right = (_read_camera(fields.below(side)) for side in ("left", "right"))
+    return StereoCalibration(left, right, T)
+
+
+def _content(calibration: Rig) -> dict[str, Any]:
+    if isinstance(calibration, RectifiedCamera):
+        numbers = {name: float(getattr(calibration, name)) for name in _RECTIFIED}
+        size = {"width_px": calibration.width_px, "height_px": calibration.height_px}
+        searched = {} if calibration.ndisp is None else {"ndisp": calibration.ndisp}
+        return {"kind": "rectified", "camera": {**size, **numbers, **searched}}
+    T = calibration.T_right_left
+    return {
+        "kind": "stereo",
+        "left": _camera_content(calibration.left),
+        "right": _camera_content(calibration.right),
+        "right_from_left": {"rotation": T[:3, :3].tolist(), "translation_m": T[:3, 3].tolist()},
+    }
+
+
+def _camera_content(camera: CameraIntrinsics) -> dict[str, Any]:
+    K = camera.matrix
+    pinhole = {"fx_px": K[0, 0], "fy_px": K[1, 1], "cx_px": K[0, 2], "cy_px": K[1, 2]}
+    return {
+        "model": camera.model,
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        **{name: float(value) for name, value in pinhole.items()},
+        "distortion": dict(zip(_NAMES[camera.model], camera.distortion.tolist(), strict=False)),
+    }
+
+
+def _read_camera(fields: Fields) -> CameraIntrinsics:
+    model = cast("LensModel", fields.text("model"))
+    if model not in _NAMES:
+        raise FormatError("unknown lens model", got=model, expected="pinhole or fisheye")
+    fx, fy, cx, cy = (fields.number(name) for name in ("fx_px", "fy_px", "cx_px", "cy_px"))
+    given, names = fields.below("distortion"), _NAMES[model]
+    known = [name for name in names if name in given]
+    if known != list(names[: len(known)]):
+        raise FormatError("distortion has gaps", got=", ".join(known), expected=", ".join(names))
+    distortion = np.array([given.number(name) for name in known], dtype=np.float64)
+    size = fields.count("width_px"), fields.count("height_px")
+    return CameraIntrinsics(pinhole_matrix(fx, fy, cx, cy), distortion, *size, model)
+
 
 _COMMA, _POINT = re.compile(r"\d,\d"), re.compile(r"^[^%<\n]*\d\.", re.MULTILINE)
 #: Numbers of rectified cameras in the settings of ORB-SLAM.
@@ -55,16 +155,15 @@ def read_calibration(
     """Read the calibration of images of one size from a file of any supported format.
 
     Supported are our own YAML, KITTI's ``calib.txt`` and ``calib_cam_to_cam.txt`` (its rectified or
-    raw ``cameras``, according to the image size; None = the grey pair if it has one), Middlebury's
+    raw ``cameras``, by the image size; None = the grey pair if it has one), Middlebury's
     ``calib.txt``, OpenCV's ``FileStorage`` files (translation in so many ``metres_per_unit``), ROS
-    CameraInfo (either of the two files; the other is expected in the same folder), and kalibr's
-    camera chain. Rectified images give a `RectifiedCamera`.
+    CameraInfo (one of two files in a folder), and kalibr's camera chain. Rectified images give a
+    `RectifiedCamera`.
 
     Raises:
-        FormatError: The file is missing, damaged or of an unknown format, or it does not contain
-            the image size (KITTI's and some of OpenCV's do not) and none is given.
-        CalibrationError: The calibration cannot give depth, such as one with left and right
-            swapped, or is of another image size.
+        FormatError: The file is missing, damaged or of an unknown format, or no image size is
+            known.
+        CalibrationError: It cannot give depth, or is of another image size.
     """
     size = None if width_px is None or height_px is None else (width_px, height_px)
     if is_zipfile(path):

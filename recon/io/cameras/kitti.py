@@ -127,13 +127,13 @@ def read_kitti_rig(path: StrPath, width_px: int, height_px: int, cameras: tuple[
         expected = f"{rectified[0]}x{rectified[1]} rectified, or {recorded[0]}x{recorded[1]} raw"
         raise other_size(width_px, height_px, expected, path)
     T_left_0, T_right_0 = (_pose(fields, camera) for camera in cameras)
-    left, right = (_camera(fields, camera, recorded) for camera in cameras)
+    left, right = (
+        CameraIntrinsics(
+            fields.numbers(f"K_{n:02d}", (3, 3)), fields.numbers(f"D_{n:02d}", (5,)), *recorded[:2]
+        )
+        for n in cameras
+    )
     return StereoCalibration(left, right, T_right_0 @ invert(T_left_0))
-
-
-def _camera(fields: Fields, camera: int, size: tuple[int, ...]) -> CameraIntrinsics:
-    matrix = fields.numbers(f"K_{camera:02d}", (3, 3))
-    return CameraIntrinsics(matrix, fields.numbers(f"D_{camera:02d}", (5,)), size[0], size[1])
 
 
 def _pose(fields: Fields, camera: int) -> Float64:

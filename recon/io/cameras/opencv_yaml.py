@@ -67,10 +67,9 @@ def read_opencv_calibration(
 ) -> Rig:
     """Read two raw cameras (``M1 D1 M2 D2``, or ``cameraMatrix1`` …) and their pose (``R T``).
 
-    Of OpenCV's pair, a file without ``R``, the file with ``extrinsics`` in place of ``intrinsics``
-    in its name is read too. A file of ``P1`` and ``P2`` alone is of rectified images. ``size_px``
-    (width, height) is for files that do not state it; ``metres_per_unit`` is the unit of ``T``,
-    such as the square size of a board of squares of 1.
+    Of OpenCV's pair of files, ``intrinsics`` without ``R``, the ``extrinsics`` beside are read,
+    too. A file of ``P1`` and ``P2`` alone is of rectified images. ``size_px`` (width, height) is
+    for files that do not state it; ``metres_per_unit`` is the unit of ``T``.
     """
     nodes = read_file_storage(path)
     stated = _size(nodes)
@@ -89,9 +88,15 @@ def read_opencv_calibration(
     model = _model(nodes)
     lens: LensModel = model or "pinhole"
     left, right = (_camera(nodes, side, size, lens) for side in (0, 1))
-    if model is None:
+    if model is None:  # the lenses may as well be fisheyes
         for camera in (left, right):
-            _check_model(camera)
+            wide = camera.width_px / 2 > camera.matrix[0, 0]
+            largest = np.abs(camera.distortion).max(initial=0.0)
+            if camera.distortion.size == 4 and wide and 0 < largest < _FISHEYE_LIKE:
+                raise FormatError(
+                    "calibration does not say which lens model its four coefficients belong to",
+                    expected="a line 'distortion_model: fisheye', or 'distortion_model: pinhole'",
+                )
     if stated is None:
         check_unsized((left.matrix[0, 2], left.matrix[1, 2]), *size, path)
     beside = Path(path).with_name(Path(path).name.replace("intrinsics", "extrinsics"))
@@ -108,7 +113,6 @@ def read_opencv_calibration(
 def _rectified(
     nodes: Nodes, size: tuple[int, int], metres_per_unit: float, unsized: StrPath | None
 ) -> RectifiedCamera:
-    """Return the camera of ``P1`` and ``P2``, of images that are rectified."""
     found = {name: _matrix(nodes, (name,), (3, 4)).copy() for name in sorted(_PROJECTIONS)}
     for matrix in found.values():
         matrix[:, 3] *= metres_per_unit
@@ -128,10 +132,7 @@ def _check_unit(baseline_m: float) -> None:
 
 
 def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> None:
-    """Write one file for OpenCV's ``FileStorage``, ``T`` in metres, atomically.
-
-    XML or JSON where it is named so, else YAML.
-    """
+    """Write one file for OpenCV's ``FileStorage``: XML or JSON where it is named so, else YAML."""
     models = {calibration.left.model, calibration.right.model}
     if len(models) > 1:
         raise CalibrationError("an OpenCV file cannot store two lens models", where=path)
@@ -155,17 +156,6 @@ def _model(nodes: Nodes) -> LensModel | None:
     if not named:
         return None
     return "fisheye" if named & _FISHEYE_NAMES else "pinhole"
-
-
-def _check_model(camera: CameraIntrinsics) -> None:
-    """Raise if a camera of an unnamed lens model may as well be a fisheye."""
-    wide = camera.width_px / 2 > camera.matrix[0, 0]
-    largest = np.abs(camera.distortion).max(initial=0.0)
-    if camera.distortion.size == 4 and wide and 0 < largest < _FISHEYE_LIKE:
-        raise FormatError(
-            "calibration does not say which lens model its four coefficients belong to",
-            expected="a line 'distortion_model: fisheye', or 'distortion_model: pinhole'",
-        )
 
 
 def _find(nodes: Nodes, names: Sequence[str]) -> Float64 | None:

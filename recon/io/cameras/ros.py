@@ -68,10 +68,7 @@ def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
 
 @reader
 def read_camera_info(path: StrPath, size: tuple[int, int] | None = None) -> StereoCalibration:
-    """Read a rig from either of its two files; its pose follows from ``R`` and ``P`` of both.
-
-    ``size`` is width and height of the images; rectified ones that ``K`` is not of are refused.
-    """
+    """Read a rig from either of its two files; its pose follows from ``R`` and ``P`` of both."""
     left_path, right_path = camera_info_paths(path)
     if not (left_path.is_file() and right_path.is_file()):
         missing = right_path if left_path.is_file() else left_path
@@ -79,6 +76,7 @@ def read_camera_info(path: StrPath, size: tuple[int, int] | None = None) -> Ster
         raise FormatError("CameraInfo of the other camera is missing", where=missing, hint=hint)
     (left, R_left, P_left), (right, R_right, P_right) = map(_read_one, (left_path, right_path))
     projections = P_left, P_right
+    # The images may be rectified, and K be of others.
     stated = left.width_px, left.height_px
     if size and are_rectified((left.matrix, right.matrix), projections, stated, size):
         focal, cx, cy = P_left[[0, 0, 1], [0, 2, 2]]
@@ -114,8 +112,8 @@ def are_rectified(
 ) -> bool:
     """Return whether images of a size (width, height) are what both ``P`` are of, and no ``K``.
 
-    What writes rectified images may state ``K`` and ``D`` of the cameras, whose images were larger,
-    as kitti2bag does, under the ``stated`` size (0 = none) of either.
+    Rectified images may come with ``K`` and ``D`` of larger raw ones, as kitti2bag writes them,
+    under the ``stated`` size (0 = none) of either.
     """
 
     def off(both: tuple[Float64, Float64], of: tuple[int, int]) -> float:
@@ -178,25 +176,21 @@ def write_camera_info(
     for side, camera, rotation, shift in zip(_SIDES, cameras, rotations, shifts, strict=True):
         P = np.hstack([rectified.matrix, [[shift], [0.0], [0.0]]])
         P[0, 2] = rectified.cx_right_px if side == "right" else rectified.cx_px
-        texts.append(_camera_info(side, camera, rotation, P))
+        name, coefficients = _name_lens(ROS_MODELS, camera, "ROS CameraInfo")
+        content = {
+            "image_width": camera.width_px,
+            "image_height": camera.height_px,
+            "camera_name": side,
+            "camera_matrix": _matrix(camera.matrix),
+            "distortion_model": name,
+            "distortion_coefficients": _matrix(coefficients.reshape(1, -1)),
+            "rectification_matrix": _matrix(rotation),
+            "projection_matrix": _matrix(P),
+        }
+        texts.append(yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
     for target, text in zip(paths, texts, strict=True):
         write_text(target, text)
     return paths
-
-
-def _camera_info(side: str, camera: CameraIntrinsics, rotation: Float64, P: Float64) -> str:
-    name, coefficients = _name_lens(ROS_MODELS, camera, "ROS CameraInfo")
-    content = {
-        "image_width": camera.width_px,
-        "image_height": camera.height_px,
-        "camera_name": side,
-        "camera_matrix": _matrix(camera.matrix),
-        "distortion_model": name,
-        "distortion_coefficients": _matrix(coefficients.reshape(1, -1)),
-        "rectification_matrix": _matrix(rotation),
-        "projection_matrix": _matrix(P),
-    }
-    return yaml.safe_dump(content, sort_keys=False, default_flow_style=None)
 
 
 def _matrix(values: NDArray[Any]) -> dict[str, Any]:

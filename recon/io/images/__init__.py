@@ -1,1 +1,1 @@
-"""Images, videos and disparity maps."""
+"""Images and disparity maps."""

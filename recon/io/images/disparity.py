@@ -28,11 +28,8 @@ def read_disparity(path: StrPath) -> Float32:
 def read_pfm(path: StrPath) -> Float32:
     """Read a grey PFM file: float32 (H, W), first row at the top; NaN where it has ±inf or NaN.
 
-    The sign of the scale gives the byte order. Its magnitude is ignored, as in Middlebury's own
-    reader: their files have 1/255 there, but the values are pixels.
-
-    Raises:
-        FormatError: The file is missing, truncated, not a PFM, or a colour PFM.
+    The sign of the scale gives the byte order. Its magnitude is ignored, as by Middlebury, whose
+    files have 1/255 there for values in pixels. A damaged file or one in colour is a `FormatError`.
     """
     content = read_bytes(path)
     header = _HEADER.match(content)

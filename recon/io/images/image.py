@@ -14,11 +14,10 @@ import warnings
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -64,13 +63,12 @@ def read_image(
 ) -> UInt8:
     """Read PNG, JPEG, PGM, PPM, BMP or TIFF: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
-    16 bits are scaled to 8, linearly: ``white``, the same for all images of a drive (`find_white`),
-    becomes 255. An alpha channel is dropped. The EXIF orientation is ignored: a calibration refers
-    to the pixels as the sensor recorded them.
+    16 bits are scaled to 8: ``white`` (`find_white`) becomes 255. Alpha is dropped; the EXIF
+    orientation is ignored, as a calibration refers to the pixels as the sensor recorded them.
 
     Raises:
-        FormatError: The file is missing, empty, truncated, not an image, has more than
-            ``max_megapixels`` (10⁶ pixels), or floating-point pixels.
+        FormatError: The file is missing, truncated, not an image, has more than ``max_megapixels``
+            (10⁶ pixels), or floating-point pixels.
     """
     return eight_bits(read_levels(path, max_megapixels), white)
 
@@ -111,7 +109,7 @@ def _decode(content: bytes, max_megapixels: float) -> NDArray[Any]:
         raise FormatError(what, got=f"{size[0]}x{size[1]}", expected=expected, hint=hint)
     check_image_bytes(content)
     try:
-        with silent_opencv() if is_tiff(content) else nullcontext():
+        with silent_opencv() if content.startswith(_TIFF_STARTS) else nullcontext():
             image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise FormatError("image cannot be decoded", got=error.err) from error
@@ -136,7 +134,21 @@ def read_grey_levels(path: StrPath) -> NDArray[Any]:
 def write_image(path: StrPath, image: NDArray[Any]) -> None:
     """Write uint8 or uint16, (H, W) or RGB (H, W, 3), atomically, in the format of the suffix."""
     suffix = Path(path).suffix.lower()
-    _check_writable(path, suffix, image)
+    got = f"{image.dtype.name} {image.shape}"
+    grey, colour = image.ndim == 2, image.ndim == 3 and image.shape[2] == 3
+    if image.dtype not in (np.uint8, np.uint16) or not (grey or colour) or image.size == 0:
+        expected = "uint8 or uint16 (H, W) or (H, W, 3)"
+        raise ShapeError("array is not an image", got=got, expected=expected)
+    if suffix not in _WRITABLE:
+        what, expected = "unknown image format", ", ".join(sorted(_WRITABLE))
+        raise OutputError(what, where=path, got=suffix or "no suffix", expected=expected)
+    if (
+        (suffix in _GREY_ONLY and colour)
+        or (suffix in _COLOUR_ONLY and grey)
+        or (suffix in _EIGHT_BIT_ONLY and image.dtype != np.uint8)
+    ):
+        what = f"a {suffix} file cannot hold this image"
+        raise OutputError(what, where=path, got=got, hint="write .png")
     write_bytes(path, encode_image(image, suffix, path))
 
 
@@ -170,24 +182,6 @@ def swap_red_and_blue(image: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(image[:, :, ::-1])
 
 
-def _check_writable(path: StrPath, suffix: str, image: NDArray[Any]) -> None:
-    got = f"{image.dtype.name} {image.shape}"
-    grey, colour = image.ndim == 2, image.ndim == 3 and image.shape[2] == 3
-    if image.dtype not in (np.uint8, np.uint16) or not (grey or colour) or image.size == 0:
-        expected = "uint8 or uint16 (H, W) or (H, W, 3)"
-        raise ShapeError("array is not an image", got=got, expected=expected)
-    if suffix not in _WRITABLE:
-        what, expected = "unknown image format", ", ".join(sorted(_WRITABLE))
-        raise OutputError(what, where=path, got=suffix or "no suffix", expected=expected)
-    if (
-        (suffix in _GREY_ONLY and colour)
-        or (suffix in _COLOUR_ONLY and grey)
-        or (suffix in _EIGHT_BIT_ONLY and image.dtype != np.uint8)
-    ):
-        what = f"a {suffix} file cannot hold this image"
-        raise OutputError(what, where=path, got=got, hint="write .png")
-
-
 def pixels_of_ros_image(
     data: NDArray[np.uint8],
     encoding: str,
@@ -199,7 +193,7 @@ def pixels_of_ros_image(
 ) -> UInt8:
     """Decode the bytes (N,) of a ROS image message: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
-    Rows are ``step`` bytes long. 16-bit pixels are scaled over their full range to 8 bits.
+    Rows are ``step`` bytes long; 16-bit pixels are scaled over their full range.
 
     Ref: ``sensor_msgs/image_encodings.hpp``.
     """
@@ -235,8 +229,9 @@ _READERS: Final[dict[bytes, type[ImageFile]]] = {
     b"\x89PNG": PngImageFile, b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"P": PpmImageFile,
 }  # fmt: skip
 _TIFF_WIDTH, _TIFF_HEIGHT, _EXIF_IFD = 256, 257, 0x8769
-_FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
-_SENSOR_RESOLUTION, _SENSOR_UNIT, _SENSOR_WIDTH_PX = 0xA20E, 0xA210, 0xA002
+_SENSOR_UNIT: Final = 0xA210
+#: Focal length, its 35 mm equivalent, pixels of the sensor per unit, width of the recorded image.
+_EXIF_NUMBERS: Final = (0x920A, 0xA405, 0xA20E, 0xA002)
 _MM_PER_UNIT: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _DIAGONAL_35MM: Final = math.hypot(36.0, 24.0)
 
@@ -251,13 +246,8 @@ def check_image_bytes(content: bytes) -> None:
         _check_pnm(content)
     elif content.startswith(b"BM"):
         _check_bmp(content)
-    elif not is_tiff(content):
+    elif not content.startswith(_TIFF_STARTS):
         raise FormatError("not an image", expected="PNG, JPEG, PGM, PPM, BMP or TIFF")
-
-
-def is_tiff(content: bytes) -> bool:
-    """Return whether the content starts like a TIFF."""
-    return content.startswith(_TIFF_STARTS)
 
 
 def _truncated(kind: str, got: str) -> FormatError:
@@ -266,7 +256,7 @@ def _truncated(kind: str, got: str) -> FormatError:
 
 
 def _check_png(content: bytes) -> None:
-    """Walk the chunks up to IEND; each must be complete and match its checksum."""
+    # Each chunk up to IEND must be complete and match its checksum.
     at, name = len(_PNG_START), b""
     while name != b"IEND":
         if at + 12 > len(content):
@@ -283,7 +273,7 @@ def _check_png(content: bytes) -> None:
 
 
 def _check_jpeg(content: bytes) -> None:
-    """Look for the end marker after the start of scan; an embedded thumbnail has its own."""
+    # The end marker comes after the start of scan; an embedded thumbnail has its own.
     at = 2
     while content[at : at + 2] != b"\xff\xda":
         if at + 4 > len(content) or content[at] != 0xFF:
@@ -309,7 +299,7 @@ def _check_pnm(content: bytes) -> None:
 
 
 def _check_bmp(content: bytes) -> None:
-    """Compute the size from rows padded to four bytes, as a header may declare a size of 0."""
+    # Rows are padded to four bytes; a header may declare a size of 0.
     if len(content) < _BMP_HEADER.size:
         size = counted(len(content), "byte")
         raise _truncated("BMP", f"the file ends after {size}, in its header")
@@ -322,21 +312,16 @@ def _check_bmp(content: bytes) -> None:
         raise _truncated("BMP", f"{len(content)} of {counted(needed, 'byte')}")
 
 
-@contextmanager
-def _silent_pillow() -> Iterator[None]:
-    """Leave unsaid what Pillow warns of in damaged headers: their check says it in a line."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
-
-
 def stated_size(content: bytes) -> tuple[int, int] | None:
     """Return the width and height that a header states; None = a damaged or unknown one."""
     reader = next((kind for start, kind in _READERS.items() if content.startswith(start)), None)
     try:
         with _silent_pillow():
-            if is_tiff(content):
-                width, height = _tiff_size(content)
+            if content.startswith(_TIFF_STARTS):  # Pillow's reader knows fewer kinds of pixels
+                directory, stream = ImageFileDirectory_v2(content[:8]), BytesIO(content)
+                stream.seek(directory.next)
+                directory.load(stream)
+                width, height = directory[_TIFF_WIDTH], directory[_TIFF_HEIGHT]
             elif reader is not None:  # `PIL.Image.open` has a limit of its own
                 width, height = reader(BytesIO(content)).size
             else:
@@ -346,16 +331,15 @@ def stated_size(content: bytes) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _tiff_size(content: bytes) -> tuple[int, int]:
-    """Read the first directory alone: Pillow's reader knows fewer kinds of pixels than ours."""
-    directory, stream = ImageFileDirectory_v2(content[:8]), BytesIO(content)
-    stream.seek(directory.next)
-    directory.load(stream)
-    return directory[_TIFF_WIDTH], directory[_TIFF_HEIGHT]
+@contextmanager
+def _silent_pillow() -> Iterator[None]:
+    """Leave unsaid what Pillow warns of in damaged headers: their check says it in a line."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
-@dataclass(frozen=True)
-class ExifFocal:
+class ExifFocal(NamedTuple):
     """A focal length in pixels of the image, and what the camera recorded for it."""
 
     focal_px: float
@@ -367,28 +351,19 @@ def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal
     try:
         with _silent_pillow(), reading(path), Image.open(path) as image:
             tags: Mapping[int, Any] = image.getexif().get_ifd(_EXIF_IFD)
-            return _by_sensor(tags, width_px) or _by_35mm(tags, width_px, height_px)
+            unit_mm = _MM_PER_UNIT.get(tags.get(_SENSOR_UNIT, 2))
+            focal_mm, equivalent_mm, resolution, recorded_px = (
+                _number(tags.get(name)) for name in _EXIF_NUMBERS
+            )
     except FormatError:
         return None
-
-
-def _by_sensor(tags: Mapping[int, Any], width_px: int) -> ExifFocal | None:
-    focal_mm = _number(tags.get(_FOCAL_LENGTH))
-    resolution = _number(tags.get(_SENSOR_RESOLUTION))
-    unit_mm = _MM_PER_UNIT.get(tags.get(_SENSOR_UNIT, 2))
-    recorded_px = _number(tags.get(_SENSOR_WIDTH_PX))
-    if focal_mm is None or resolution is None or unit_mm is None or recorded_px is None:
-        return None
-    focal_px = focal_mm * resolution / unit_mm * width_px / recorded_px
-    return ExifFocal(focal_px, f"{focal_mm:g} mm and the pixels of the sensor")
-
-
-def _by_35mm(tags: Mapping[int, Any], width_px: int, height_px: int) -> ExifFocal | None:
-    equivalent_mm = _number(tags.get(_FOCAL_LENGTH_35MM))
-    if equivalent_mm is None:
-        return None
-    focal_px = equivalent_mm * math.hypot(width_px, height_px) / _DIAGONAL_35MM
-    return ExifFocal(focal_px, f"{equivalent_mm:g} mm as 35 mm equivalent")
+    if focal_mm and resolution and unit_mm and recorded_px:
+        focal_px = focal_mm * resolution / unit_mm * width_px / recorded_px
+        return ExifFocal(focal_px, f"{focal_mm:g} mm and the pixels of the sensor")
+    if equivalent_mm:
+        focal_px = equivalent_mm * math.hypot(width_px, height_px) / _DIAGONAL_35MM
+        return ExifFocal(focal_px, f"{equivalent_mm:g} mm as 35 mm equivalent")
+    return None
 
 
 def _number(value: Any) -> float | None:

@@ -81,10 +81,7 @@ class ColmapModel:
         error_px: float,
         track: Sequence[tuple[int, int]],
     ) -> None:
-        """Add a point; ``track`` has image and place in what it sees, of all that see it.
-
-        ``error_px`` is the mean distance, over its images, from where it is seen to where it is.
-        """
+        """Add a point; ``track`` has image and place in what it sees, of all that see it."""
         words = [word for sighting in track for word in sighting]
         point = number, *xyz.tolist(), *rgb, error_px
         self._line("points3D", *point, *words)

@@ -1,18 +1,22 @@
-"""Point clouds as LAS and LAZ files (extra ``survey``), the formats of surveying programs."""
+"""Point clouds for surveying programs (extra ``survey``): LAS, LAZ, COPC and E57 files."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from os import SEEK_END
 from pathlib import Path
 from typing import Any, Final
+from uuid import uuid4
 
 import numpy as np
 
 from recon.core.errors import EvaluationError, SettingsError, require
 from recon.core.geometry.se3 import apply
+from recon.core.kernels.voxels import KEY_BITS, pack_keys
 from recon.core.values import PointCloud
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool, Float64, Int64
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
 from recon.io.models.columns import columns_of, with_first
@@ -34,12 +38,11 @@ def write_las(
     step_m: float = _STEP_M,
     ground: AreGround | None = None,
 ) -> int:
-    """Write clouds into one LAS 1.4 file, atomically; compressed if it ends in ``.laz``.
+    """Write clouds into one LAS 1.4 file, atomically, compressed in ``.laz``; returns their points.
 
-    Positions are rounded to multiples of ``step_m``; colours and, as extra dimensions, what else
-    `ATTRIBUTES` say are written where the clouds have them, all the same. ``T_to_from``
-    (4, 4) leads to the coordinates of the file, in the system ``crs``. Points that ``ground`` says
-    are ground have class 2, all others 1, unclassified. The number of points is returned.
+    Positions are rounded to ``step_m``; colours and, as extra dimensions, what else `ATTRIBUTES`
+    say are those of the first cloud. ``T_to_from`` (4, 4) leads to the coordinates of the file, in
+    the system ``crs``. Points that ``ground`` says are ground have class 2, others 1, unclassified.
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
@@ -70,7 +73,7 @@ def packing(path: StrPath) -> Iterator[Path]:
 def las_header(
     laspy: Any, first: PointCloud, T_to_from: Float64, crs: str | None, step_m: float
 ) -> Any:
-    """Return the header of a file as `write_las` describes it, without points."""
+    """Return the header of a file as `write_las` describes it."""
     header = laspy.LasHeader(point_format=COLOURED, version="1.4")
     header.generating_software = "recon"
     header.global_encoding.wkt = True  # as the format of its points needs, even without a system
@@ -155,3 +158,151 @@ def las_record(
         own = name in header.point_format.extra_dimension_names
         record[name] = values if own else values.astype(np.uint16) * _FULL_COLOUR
     return record
+
+
+_CELL_BITS: Final = 7  # a node has 128 cells along each side, with a point for each
+_INFO: Final = struct.Struct("<5d2Q2d88x")  # the first record of the file
+_INFO_AT: Final = 375 + 54  # behind the header of LAS 1.4 and that of the record
+_LONG: Final = struct.Struct("<2x16sHQ32s")  # the header of a record behind the points
+_ENTRY: Final = np.dtype(
+    [("node", "<i4", 4), ("offset", "<u8"), ("bytes", "<i4"), ("points", "<i4")]
+)
+
+
+def write_copc(
+    path: StrPath,
+    clouds: Iterable[PointCloud],
+    T_to_from: Float64,
+    crs: str | None = None,
+    *,
+    step_m: float,
+    ground: AreGround | None = None,
+) -> int:
+    """Write clouds into one COPC file as `write_las` does, with all points in memory.
+
+    Ref: https://copc.io, version 1.0.
+    """
+    laspy, lazrs = require("laspy", extra=_EXTRA), require("lazrs", extra=_EXTRA)
+    first, clouds = with_first(clouds)
+    header = las_header(laspy, first, T_to_from, crs, step_m)
+    records = [las_record(laspy, header, cloud, T_to_from, ground) for cloud in clouds]
+    points = laspy.ScaleAwarePointRecord.empty(header=header)
+    points.array = np.concatenate([points.array, *(one.array for one in records)])
+    steps = np.stack([points.array[axis] for axis in "XYZ"], axis=1).astype(np.int64)
+    low, high = (steps.min(axis=0), steps.max(axis=0)) if len(steps) else np.zeros((2, 3), int)
+    # The cube is no larger than its longest side: there are readers that take that for granted.
+    side = max(1, int((high - low).max()))
+    nodes = _octree(steps - low, side)
+    order = np.lexsort(nodes.T[::-1])
+    nodes = nodes[order]
+    begins = np.flatnonzero(np.diff(nodes, axis=0, prepend=-1).any(axis=1))
+    chunks = np.split(points.array[order], begins[1:])
+
+    packed = lazrs.LazVlr.new_for_compression(COLOURED, points.point_format.num_extra_bytes, True)
+    info = laspy.VLR("copc", 1, "", bytes(_INFO.size))
+    header.update(points)
+    header.vlrs[:0] = [info, laspy.vlrs.known.LasZipVlr(packed.record_data())]
+    header.are_points_compressed, header.number_of_evlrs = True, 1
+    with packing(path) as temporary, temporary.open("w+b") as file:
+        header.write_to(file)
+        packer = lazrs.ParLasZipCompressor(file, packed)
+        packer.compress_chunks([np.frombuffer(chunk, np.uint8) for chunk in chunks])
+        packer.done()
+        header.start_of_first_evlr = file.seek(0, SEEK_END)
+        file.seek(header.offset_to_point_data)
+        entries = np.zeros(len(begins), _ENTRY)
+        entries["points"], entries["bytes"] = np.array(lazrs.read_chunk_table(file, packed)).T
+        # A chunk begins where those before it end, the first behind where their table is.
+        ends = header.offset_to_point_data + 8 + np.cumsum(entries["bytes"])
+        entries["node"], entries["offset"] = nodes[begins], ends - entries["bytes"]
+        file.seek(header.start_of_first_evlr)
+        file.write(_LONG.pack(b"copc", 1000, entries.nbytes, b"") + entries.tobytes())
+        file.seek(0)
+        header.write_to(file, ensure_same_size=True)
+        half_m, hierarchy_at = step_m * side / 2, header.start_of_first_evlr + _LONG.size
+        cube = *(header.offsets + step_m * low + half_m), half_m, 2 * half_m / (1 << _CELL_BITS)
+        file.seek(_INFO_AT)
+        file.write(_INFO.pack(*cube, hierarchy_at, entries.nbytes, 0.0, 0.0))
+    return len(points)
+
+
+def _octree(steps: Int64, side: int) -> Int64:
+    """Return the node (N, 4), depth and cell, of each point (N, 3) in a cube, all in steps.
+
+    A node has the first of the points left in each of its cells, the deepest ones all.
+    """
+    nodes, left = np.zeros((len(steps), 4), np.int64), np.arange(len(steps))
+    for depth in range(KEY_BITS - _CELL_BITS):
+        bits = depth + _CELL_BITS
+        cells = np.minimum((steps[left] << bits) // side, (1 << bits) - 1)
+        nodes[left, 0], nodes[left, 1:] = depth, cells >> _CELL_BITS
+        _, first = np.unique(pack_keys(cells), return_index=True)
+        left = np.delete(left, first)
+    return nodes
+
+
+_AXES: Final = ("cartesianX", "cartesianY", "cartesianZ")
+
+
+def write_e57(
+    path: StrPath, clouds: Iterable[PointCloud], T_to_from: Float64, crs: str | None = None
+) -> int:
+    """Write clouds into one E57 file, atomically, each as a scan; returns the number of points.
+
+    Positions are doubles from an offset of whole metres, the pose of each scan, so that programs
+    that round to single precision keep millimetres. ``T_to_from`` (4, 4) and ``crs`` are as in
+    `write_las`.
+
+    Ref: ASTM E2807, "Standard specification for 3D imaging data exchange".
+    """
+    pye57 = require("pye57", extra="survey")
+    wkt = "" if crs is None else check_crs(crs).to_wkt()
+    offset_m, points = np.floor(T_to_from[:3, 3]), 0
+    T_scan_from = T_to_from.copy()
+    T_scan_from[:3, 3] -= offset_m
+    with atomic_path(path) as temporary:
+        try:
+            with _opened(pye57, str(temporary), wkt) as file:
+                for cloud in filter(len, clouds):
+                    data = _columns(cloud, T_scan_from)
+                    name = f"part {file.scan_count}"
+                    file.write_scan_raw(data, name=name, translation=offset_m)
+                    points += len(cloud)
+        except pye57.libe57.E57Exception as error:
+            raise OSError(str(error).partition("****")[0].strip()) from error
+    return points
+
+
+def _opened(pye57: Any, path: str, wkt: str) -> Any:
+    """Open a file to be written; pye57 would leave its coordinate system empty for good."""
+
+    class File(pye57.E57):  # type: ignore[misc]
+        def write_default_header(self) -> None:
+            node, file = pye57.libe57, self.image_file
+            file.extensionsAdd("", node.E57_V1_0_URI)
+            nodes = {
+                "formatName": node.StringNode(file, "ASTM E57 3D Imaging Data File"),
+                "guid": node.StringNode(file, f"{{{uuid4()}}}"),
+                "versionMajor": node.IntegerNode(file, node.E57_FORMAT_MAJOR),
+                "versionMinor": node.IntegerNode(file, node.E57_FORMAT_MINOR),
+                "coordinateMetadata": node.StringNode(file, wkt),
+                "data3D": node.VectorNode(file, True),
+                "images2D": node.VectorNode(file, True),
+            }
+            for name, value in nodes.items():
+                self.root.set(name, value)
+
+        def __del__(self) -> None:
+            """Do not close again what a full disk kept from being closed: Python would print it."""
+
+    return File(path, mode="w")
+
+
+def _columns(cloud: PointCloud, T_scan_from: Float64) -> dict[str, Any]:
+    xyz = apply(T_scan_from, cloud.xyz.astype(np.float64))
+    columns: dict[str, Any] = {
+        name: np.ascontiguousarray(values) for name, values in zip(_AXES, xyz.T, strict=True)
+    }
+    columns["cartesianInvalidState"] = np.zeros(len(cloud), np.int8)  # readers look for it
+    own = columns_of(cloud, "e57").items()
+    return columns | {name: np.ascontiguousarray(values) for name, values in own}

@@ -1,33 +1,31 @@
-"""Meshes as PLY, OBJ, STL and GLB files, according to the suffix."""
+"""Meshes as PLY, OBJ, STL and GLB files, and MeshLab projects (.mlp) of several layers."""
 
 from __future__ import annotations
 
 import json
+import os
 import struct
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
+from xml.etree import ElementTree as ET
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.errors import FormatError, OutputError, SettingsError
-from recon.core.geometry.se3 import T_YUP_FRAME
-from recon.core.values import Texture, TriangleMesh
-from recon.core.values.arrays import UInt8
+from recon.core.errors import FormatError, MeshingError, OutputError, SettingsError
+from recon.core.geometry.se3 import T_YUP_FRAME, make_transform
+from recon.core.lazy import Lazy
+from recon.core.text import counted
+from recon.core.values import RectifiedCamera, Texture, TriangleMesh
+from recon.core.values.arrays import Float32, Float64, Int32, UInt8
 from recon.core.values.cloud import Frame
 from recon.io.atomic import atomic_path, write_bytes, write_text
-from recon.io.files import StrPath, reader
+from recon.io.files import StrPath, reader, resolved
 from recon.io.images.image import encode_image, write_image
-from recon.io.models.columns import attributes_in, columns_of, positions_in, table_of
-from recon.io.models.ply_tables import (
-    Table,
-    list_length,
-    read_tables,
-    write_table_parts,
-    write_tables,
-)
+from recon.io.models.columns import Table, attributes_in, columns_of, positions_in, table_of
+from recon.io.models.ply import LIST_LENGTH, read_tables, write_table_parts, write_tables
 
 MESH_SUFFIXES: Final = (".ply", ".obj", ".stl", ".glb")
 _INDICES: Final = ("vertex_indices", "vertex_index")  # both names are in use
@@ -42,10 +40,9 @@ _UNLIT: Final = "KHR_materials_unlit"  # colours of images already include the l
 def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> None:
     """Write a mesh atomically, as .ply, .obj, .stl or .glb by the suffix of the file.
 
-    PLY is binary with float vertices. PLY, OBJ and GLB keep normals, colours and texture; STL has
-    none. The image of a texture is written beside a PLY or OBJ, which has its material in a third
-    file. GLB is glTF 2.0 in one file, which viewers show upright if the ``frame`` of the axes is
-    known.
+    PLY (binary, float), OBJ and GLB keep normals, colours and texture. The image of a texture is
+    written beside a PLY or OBJ, with a material beside OBJ; GLB has it inside, and is shown upright
+    if the ``frame`` of the axes is known.
 
     Raises:
         OutputError: The suffix is unknown, the mesh has no face, or the file cannot be written.
@@ -65,11 +62,11 @@ def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) ->
     elif suffix == ".obj" and texture is not None:
         _write_textured_obj(Path(path), mesh, texture)
     else:
-        # Importing Open3D takes two seconds; PLY files do not need it.
-        from recon.io.models import open3d_meshes  # noqa: PLC0415
-
-        with atomic_path(path) as temporary:
-            open3d_meshes.write_mesh(temporary, mesh)
+        with atomic_path(path) as temporary, _quiet():
+            surface = to_open3d(mesh)
+            surface.compute_triangle_normals()
+            if not o3d.io.write_triangle_mesh(temporary, surface):
+                raise OutputError("Open3D could not write the mesh", where=path)
 
 
 def _write_textured_obj(path: Path, mesh: TriangleMesh, texture: Texture) -> None:
@@ -126,11 +123,25 @@ def read_mesh(path: StrPath) -> TriangleMesh:
     if suffix == ".ply":
         mesh = _read_ply(path)
     elif Path(path).is_file():
-        from recon.io.models import open3d_meshes  # noqa: PLC0415
-
-        mesh = open3d_meshes.read_mesh(path)
-        if suffix == ".glb" and mesh.rgb is not None:
-            mesh = replace(mesh, rgb=srgb_from_linear(mesh.rgb))
+        with _quiet():
+            found = o3d.io.read_triangle_mesh(Path(path))
+        if not found.has_triangles():
+            raise FormatError("the file has no triangles that Open3D can read", where=path)
+        normals = np.asarray(found.vertex_normals).astype(np.float32)
+        shades = np.asarray(found.vertex_colors)
+        rgb = np.rint(shades * 255).astype(np.uint8)
+        if suffix == ".glb":
+            # Open3D takes the linear colours of glTF as they are: IEC 61966-2-1.
+            shades = rgb / 255
+            curve = 1.055 * shades ** (1 / 2.4) - 0.055
+            curve = np.where(shades <= 0.0031308, 12.92 * shades, curve)
+            rgb = np.rint(curve * 255).astype(np.uint8)
+        mesh = TriangleMesh(
+            vertices=np.asarray(found.vertices).astype(np.float32),
+            faces=np.asarray(found.triangles).astype(np.int32),
+            normals=normals if found.has_vertex_normals() else None,
+            rgb=rgb if found.has_vertex_colors() else None,
+        )
     else:
         raise FormatError("no such file")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
@@ -147,8 +158,8 @@ def _tables(mesh: TriangleMesh, start: int = 0) -> dict[str, Table]:
     if mesh.texture is not None:
         columns |= {"s": mesh.texture.uv[:, 0], "t": 1 - mesh.texture.uv[:, 1]}
     name = _INDICES[0]
-    faces = np.zeros(len(mesh.faces), [(list_length(name), "u1"), (name, "<i4", (3,))])
-    faces[list_length(name)] = 3
+    faces = np.zeros(len(mesh.faces), [(name + LIST_LENGTH, "u1"), (name, "<i4", (3,))])
+    faces[name + LIST_LENGTH] = 3
     faces[name] = mesh.faces + np.int32(start)
     return {"vertex": table_of(mesh.vertices, columns), "face": faces}
 
@@ -221,13 +232,6 @@ def write_glb(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) -> 
     write_bytes(path, struct.pack("<4sII", b"glTF", 2, length) + head + body)
 
 
-def srgb_from_linear(rgb: UInt8) -> UInt8:
-    """Convert linear colours back to sRGB, for readers that ignore the colour space."""
-    ratio = rgb / 255
-    curve = np.where(ratio <= 0.0031308, 12.92 * ratio, 1.055 * ratio ** (1 / 2.4) - 0.055)
-    return np.asarray(np.rint(curve * 255), dtype=np.uint8)
-
-
 def _linear(rgb: UInt8) -> NDArray[np.uint16]:
     """Return uint16 (V, 4): linear red, green, blue and full opacity (IEC 61966-2-1)."""
     ratio = rgb / 255
@@ -254,3 +258,124 @@ def _described(arrays: list[NDArray[Any]]) -> tuple[list[dict[str, Any]], list[d
 def _chunk(kind: bytes, content: bytes, filler: bytes) -> bytes:
     content += filler * (-len(content) % 4)
     return struct.pack("<I4s", len(content), kind) + content
+
+
+o3d = Lazy("open3d")
+
+
+def to_open3d(shape: Any) -> Any:
+    """Return a mesh or a cloud as Open3D's, with its normals and colours."""
+    is_mesh, geometry = isinstance(shape, TriangleMesh), o3d.geometry
+    if is_mesh:
+        made, of = _surface(shape.vertices, shape.faces), "vertex_"
+    else:
+        made, of = geometry.PointCloud(_vectors(shape.xyz)), ""
+    if shape.normals is not None:
+        setattr(made, f"{of}normals", _vectors(shape.normals))
+    if shape.rgb is not None:
+        setattr(made, f"{of}colors", _vectors(shape.rgb / 255))
+    return made
+
+
+def decimate(
+    vertices: NDArray[Any], faces: NDArray[Any], target_faces: int
+) -> tuple[Float32, Int32]:
+    """Collapse edges until about ``target_faces`` are left (Garland & Heckbert, 1997)."""
+    with _quiet():
+        smaller = _surface(vertices, faces).simplify_quadric_decimation(
+            target_faces, boundary_weight=3.0
+        )
+    if not smaller.has_triangles():
+        got = f"target of {counted(target_faces, 'face')}"
+        raise MeshingError("decimation left no face", got=got)
+    vertices, faces = np.asarray(smaller.vertices), np.asarray(smaller.triangles)
+    return vertices.astype(np.float32), faces.astype(np.int32)
+
+
+def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
+    """Return an Open3D mesh of copies; it accepts neither read-only nor float32 arrays."""
+    return o3d.geometry.TriangleMesh(
+        _vectors(vertices), o3d.utility.Vector3iVector(np.array(faces, dtype=np.int32))
+    )
+
+
+def _vectors(values: NDArray[Any]) -> Any:
+    return o3d.utility.Vector3dVector(np.array(values, dtype=np.float64))
+
+
+def _quiet() -> Any:
+    """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
+    return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
+
+
+_IDENTITY: Final = np.eye(4)
+_SENSOR_MM: Final = 36.0  # width of the sensor of MeshLab's cameras; only ratios to it matter
+
+
+@dataclass(frozen=True)
+class Photo:
+    """The image of a camera."""
+
+    file: Path
+    camera: RectifiedCamera
+    # float64 (4, 4), its pose in the frame of the layers; else it is at their origin
+    T_frame_camera: Float64 = field(default_factory=lambda: np.eye(4))
+
+
+def write_mlp(
+    path: StrPath,
+    layers: Mapping[str, StrPath],
+    frame: Frame | None = None,
+    photos: Sequence[Photo] = (),
+) -> None:
+    """Write a MeshLab project of layers (label and existing file), atomically.
+
+    Paths are relative to it. MeshLab opens it with y up and looks along -z: layers are turned if
+    their frame is known.
+    """
+    T = _IDENTITY if frame is None else T_YUP_FRAME[frame]
+    project = ET.Element("MeshLabProject")
+    group = ET.SubElement(project, "MeshGroup")
+    for label, file in layers.items():
+        layer = {"label": label, "filename": _relative(file, Path(path)), "visible": "1"}
+        ET.SubElement(ET.SubElement(group, "MLMesh", layer), "MLMatrix44").text = _rows(T)
+    rasters = ET.SubElement(project, "RasterGroup")
+    for photo in photos:
+        _add_photo(rasters, photo, T, Path(path))
+    ET.indent(project, " ")
+    body = ET.tostring(project, encoding="unicode")
+    write_text(path, f"<!DOCTYPE MeshLabDocument>\n{body}\n")
+
+
+def _add_photo(group: ET.Element, photo: Photo, T: Float64, project: Path) -> None:
+    """Add a raster layer: an image, and where MeshLab's camera has to stand to see it."""
+    camera = photo.camera
+    pixel_mm = _SENSOR_MM / camera.width_px
+    raster = ET.SubElement(group, "MLRaster", {"label": photo.file.stem})
+    # MeshLab counts from the lower left corner of the image, and cameras look along -z. It takes
+    # the position of the camera with the other sign.
+    T_world_camera = T @ photo.T_frame_camera @ T_YUP_FRAME["camera"].T
+    R_camera_world = make_transform(T_world_camera[:3, :3].T, np.zeros(3))
+    lens = {
+        "TranslationVector": " ".join(f"{x:.10g}" for x in (*(0 - T_world_camera[:3, 3]), 1)),
+        "RotationMatrix": " ".join(_rows(R_camera_world).split()),
+        "FocalMm": f"{camera.focal_px * pixel_mm:.10g}",
+        "PixelSizeMm": f"{pixel_mm:.10g} {pixel_mm:.10g}",
+        "ViewportPx": f"{camera.width_px} {camera.height_px}",
+        "CenterPx": f"{camera.cx_px + 0.5:.10g} {camera.height_px - 0.5 - camera.cy_px:.10g}",
+    }
+    plain = {"LensDistortion": "0 0", "CameraType": "0", "BinaryData": "0"}
+    ET.SubElement(raster, "VCGCamera", lens | plain)
+    ET.SubElement(raster, "Plane", {"semantic": "1", "fileName": _relative(photo.file, project)})
+
+
+def _rows(T: Float64) -> str:
+    return "\n" + "".join(" ".join(f"{x:.10g}" for x in row) + " \n" for row in T)
+
+
+def _relative(file: StrPath, project: Path) -> str:
+    if not Path(file).is_file():
+        raise OutputError(
+            "a layer of the MeshLab project does not exist", where=file, hint="write it first"
+        )
+    return Path(os.path.relpath(resolved(file), resolved(project).parent)).as_posix()

@@ -1,12 +1,11 @@
-"""OctoMap files: ``.ot`` with log-odds, ``.bt`` with only occupied and free.
+"""OctoMap files: ``.ot`` with log-odds, ``.bt`` with only occupied and free; in pieces.
 
-Both are written and read piece by piece, without a whole tree in memory. A branch is a cube with a
-side of ``2^depth`` cells. Its cells are sorted in Morton order (x is the lowest bit), so the nodes
-of each level are runs of cells. Files list nodes depth first, so the position of every node
+A branch is a cube with a side of ``2^depth`` cells, in Morton order (x is the lowest bit), so that
+the nodes of each level are runs of cells. Files list nodes depth first: the position of every node
 follows from the sizes of the branches.
 
-Ref: A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on
-octrees", Autonomous Robots 34, 2013, section 3.4; the format is that of OctoMap 1.9.
+Ref: A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on octrees",
+Autonomous Robots 34, 2013, section 3.4; the format is that of OctoMap 1.9.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from recon.core.values import OccupancyVoxels, join_voxels
 from recon.core.values.arrays import Bool, Float32, Int32
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath, reader, reading
-from recon.io.kernels.octree import Leaves, TreeWalk, begin_walk, find_leaves
+from recon.io.kernels.octree import TreeWalk, begin_walk, find_leaves
 
 DEPTH: Final = 16
 KEY_LIMIT: Final = 1 << (DEPTH - 1)  # cell indices lie in [-KEY_LIMIT, KEY_LIMIT) on each axis
@@ -66,7 +65,12 @@ def write_octomap_tiles(
         root = _tree([node for tile in tiles for node in _nodes(tile, depth, pieces)], depth)
         for target, is_binary in ((to_binary, True), (to_full, False)):
             with target.open("wb") as file:
-                _write_tree(file, root, pieces, resolution_m, binary=is_binary)
+                kind, nodes = _BINARY_TREE if is_binary else _FULL_TREE, 0
+                if root is not None:
+                    nodes = root.branch.pruned_nodes if is_binary else root.branch.nodes
+                file.write(kind + _HEADER.format(nodes, resolution_m).encode())
+                if root is not None:
+                    _write_node(file, root, pieces, binary=is_binary)
     return binary, full
 
 
@@ -127,17 +131,6 @@ def _tree(nodes: list[_Node], depth: int) -> _Node | None:
     return nodes[0] if nodes else None
 
 
-def _write_tree(
-    file: IO[bytes], root: _Node | None, pieces: IO[bytes], resolution_m: float, *, binary: bool
-) -> None:
-    kind, nodes = _BINARY_TREE if binary else _FULL_TREE, 0
-    if root is not None:
-        nodes = root.branch.pruned_nodes if binary else root.branch.nodes
-    file.write(kind + _HEADER.format(nodes, resolution_m).encode())
-    if root is not None:
-        _write_node(file, root, pieces, binary=binary)
-
-
 def _write_node(file: IO[bytes], node: _Node, pieces: IO[bytes], *, binary: bool) -> None:
     """Write a node and all below it, depth first; a ``.bt`` stores leaves in their parents."""
     if binary and node.branch.kind != INNER:
@@ -187,21 +180,15 @@ def _cells(nodes: NDArray[np.void], walk: TreeWalk, resolution_m: float) -> Occu
     if cells > max(_FEW_CELLS, _MOST_GROWTH * len(nodes)):
         what = "the OctoMap claims far more cells than it has nodes"
         raise FormatError(what, got=f"{cells} of {len(nodes)}")
-    keys, leaf = _expand(leaves)
-    return OccupancyVoxels(keys, log_odds[leaf], resolution_m)
-
-
-def _expand(leaves: Leaves) -> tuple[Int32, NDArray[np.intp]]:
-    """Expand leaves of any size to cells, with the leaf that each belongs to."""
-    keys, source = [np.zeros((0, 3), np.int32)], [np.zeros(0, np.intp)]
+    keys, leaf = [np.zeros((0, 3), np.int32)], [np.zeros(0, np.intp)]
     for level in np.unique(leaves.levels).tolist():
         edge = 1 << (DEPTH - level)
         which = np.flatnonzero(leaves.levels == level)
         inside = np.stack(np.unravel_index(np.arange(edge**3), (edge,) * 3), axis=1)
         corners = leaves.places[which].astype(np.int32) * edge - KEY_LIMIT
         keys.append((corners[:, None] + inside.astype(np.int32)).reshape(-1, 3))
-        source.append(np.repeat(which, edge**3))
-    return np.concatenate(keys), np.concatenate(source)
+        leaf.append(np.repeat(which, edge**3))
+    return OccupancyVoxels(np.concatenate(keys), log_odds[np.concatenate(leaf)], resolution_m)
 
 
 def _read_header(file: IO[bytes]) -> tuple[int, float]:
@@ -238,17 +225,23 @@ class Branch:
 
 def encode_branch(keys: Int32, log_odds: Float32, depth: int) -> Branch:
     """Encode the branch of a cube of cells (N, 3), N ≥ 1, distinct; log-odds from 0 = occupied."""
-    code = _morton(keys.astype(np.int64) & ((1 << depth) - 1), depth)
+    cells, code = keys.astype(np.int64) & ((1 << depth) - 1), np.zeros(len(keys), np.int64)
+    for bit in range(depth):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     order = np.argsort(code)
-    levels = [code[order] >> (3 * up) for up in range(depth + 1)]
     values, kinds = [log_odds[order]], [np.where(log_odds[order] >= 0, OCCUPIED, FREE)]
-    codes, begins = [levels[0]], []
+    codes, begins = [code[order]], []
     for _ in range(depth):
         parent = codes[-1] >> 3
         begin = np.flatnonzero(np.r_[True, parent[1:] != parent[:-1]])
         begins.append(begin)
         values.append(np.maximum.reduceat(values[-1], begin))
-        kinds.append(_parents_kind(kinds[-1], begin))
+        # Eight equal leaves become a leaf; others have children.
+        low = np.minimum.reduceat(kinds[-1], begin)
+        high = np.maximum.reduceat(kinds[-1], begin)
+        whole = np.diff(np.r_[begin, len(kinds[-1])]) == 8
+        kinds.append(np.where(whole & (low == high) & (low != INNER), low, INNER))
         codes.append(parent[begin])
     full = _encode_full(codes, values, begins)
     binary, pruned_nodes = _encode_binary(codes, kinds, begins)
@@ -268,13 +261,6 @@ def join_branches(children: dict[int, Branch]) -> Branch:
     bits = sum(child.kind << (2 * place) for place, child in children.items())
     pruned = 1 + sum(child.pruned_nodes for child in children.values())
     return Branch(full, bits.to_bytes(2, "little"), value, INNER, nodes, pruned)
-
-
-def _parents_kind(kinds: _Index, begin: _Index) -> _Index:
-    """Return kinds of the parents: eight equal leaves become a leaf; others have children."""
-    low, high = np.minimum.reduceat(kinds, begin), np.maximum.reduceat(kinds, begin)
-    size = np.diff(np.r_[begin, len(kinds)])
-    return np.where((size == 8) & (low == high) & (low != INNER), low, INNER)
 
 
 def _encode_full(codes: list[_Index], values: list[Float32], begins: list[_Index]) -> bytes:
@@ -322,12 +308,3 @@ def _places(written: list[Bool], begins: list[_Index], size: int) -> list[_Index
         start = np.repeat(places[-1] + size - before[begin], counts)
         places.append(start + before)
     return places[::-1]
-
-
-def _morton(cells: NDArray[np.int64], depth: int) -> _Index:
-    """Return Morton codes of cells (N, 3) in ``[0, 2^depth)``; x is the lowest bit."""
-    code = np.zeros(len(cells), np.int64)
-    for bit in range(depth):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return code

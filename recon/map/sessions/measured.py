@@ -24,14 +24,15 @@ from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted, metres
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
-from recon.io.control_points import ControlPoints, is_control, read_control
-from recon.io.positions import Positions
+from recon.io.positions import ControlPoints, Positions, is_control, read_control
+
+pass
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.health import expected_drift
 from recon.places.places import RECEIVER_M, SIGMAS, drift_at_end, fit_to_path
 from recon.places.pose_graph import Fixes
-from recon.sources.bag_positions import read_measured
+from recon.sources.bag import read_measured
 
 LARGEST_MISFIT: Final = (
     0.01  # misfit, as a fraction of the extent of the path, that drift may explain
@@ -61,7 +62,7 @@ class Survey:
 
     Attributes:
         positions: What a receiver or a total station wrote (`recon.io.positions`), a recording with
-            `NavSatFix` (`recon.sources.bag_positions`), or rows of time in seconds, easting,
+            `NavSatFix` (`recon.sources.bag`), or rows of time in seconds, easting,
             northing and height in metres (or a TUM file), on the clock of the images. One or three
             more columns are standard deviations in metres, of all coordinates or each.
         antenna_m: Where what they are the positions of (antenna, prism) is, from the left camera:

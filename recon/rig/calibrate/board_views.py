@@ -17,7 +17,6 @@ from recon.core.text import counted
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.board import CalibrationBoard
 from recon.io.images.image import read_image, write_image
-from recon.io.images.video import VIDEOS, VideoFile
 from recon.rig.calibrate.bundle import Sighting, View
 from recon.rig.calibrate.detect import (
     check_charuco,
@@ -26,9 +25,9 @@ from recon.rig.calibrate.detect import (
     grown_size,
     orient_like,
 )
-from recon.sources.image_names import ImagePairs
+from recon.sources.images import ImagePairs
 from recon.sources.settings import SourceSettings
-from recon.sources.video import open_videos, split_views, view_size
+from recon.sources.video import VIDEOS, VideoFile, open_videos, split_views, view_size
 from recon.stereo.rectify.rectifier import to_grey
 
 _LOOKS_HZ: Final = 10.0  # looks at a video per second: a hand holds a board still for longer
@@ -66,7 +65,13 @@ def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> Boa
     """Find a board in all images of a rig."""
     files = [path for pair in images.pairs for path in pair]
     board, looks = _look_at_all(files, board, threads)
-    size = _one_size(files, looks)
+    size = looks[0].size_px
+    for path, look in zip(files, looks, strict=True):
+        if look.size_px != size:
+            got, other = ("x".join(map(str, each)) for each in (look.size_px, size))
+            what, expected = "images differ in size", f"{other} as {files[0].name}"
+            hint = "both cameras must record the same size"
+            raise SourceError(what, where=path, got=got, expected=expected, hint=hint)
     if board.kind == "chess":
         check_chessboard([look.grown for look in looks], lambda n: _read_grey(files[n]), board)
     elif not any(look.seen for look in looks):
@@ -118,18 +123,6 @@ def _read_grey(path: Path) -> UInt8:
     return to_grey(read_image(path))
 
 
-def _one_size(files: Sequence[Path], looks: Sequence[_Look]) -> tuple[int, int]:
-    first = looks[0].size_px
-    for path, look in zip(files, looks, strict=True):
-        if look.size_px != first:
-            got, other = ("x".join(map(str, size)) for size in (look.size_px, first))
-            expected = f"{other} as {files[0].name}"
-            hint = "both cameras must record the same size"
-            what = "images differ in size"
-            raise SourceError(what, where=path, got=got, expected=expected, hint=hint)
-    return first
-
-
 def is_video(where: str) -> bool:
     """Return whether an argument names a video file."""
     return Path(where).suffix.lower() in VIDEOS and Path(where).is_file()
@@ -138,18 +131,18 @@ def is_video(where: str) -> bool:
 def pick_views(
     files: Sequence[Path], settings: SourceSettings, path: Callable[[str], Path]
 ) -> ImagePairs:
-    """Write the still frames that differ most as image files, to the ``path`` of their names.
-
-    ``files`` are a left and a right video, or one with both views.
-    """
+    """Write the still frames that differ most, of two videos or one with both views."""
     videos = open_videos(files)
-    if len(videos) == 1:
-        view_size(videos[0], settings)  # checks that the frames can be halved
     every = max(1, round(videos[0].rate_hz / _LOOKS_HZ))
     looks = range(0, min(video.frames for video in videos), every)
     seen = tracked(_frames(videos, looks, settings), "frames", "find still views", total=len(looks))
-    small = np.stack([_shrunk(both) for both in seen])
-    chosen = [looks[number] for number in _choose(small)]
+    width_px, height_px = view_size(videos[0], settings) if len(videos) == 1 else videos[0].size_px
+    size = (_SMALL_PX, max(1, round(_SMALL_PX * height_px / width_px)))
+    small = [
+        np.hstack([cv2.resize(to_grey(one), size, interpolation=cv2.INTER_AREA) for one in both])
+        for both in seen
+    ]
+    chosen = [looks[number] for number in _choose(np.stack(small).astype(np.float32))]
     if not chosen:
         raise SourceError(
             "the board never stands still in the video",
@@ -172,13 +165,6 @@ def _frames(
     for images in zip(*(video.pick(list(numbers)) for video in videos), strict=True):
         views = [image for _, image in images]
         yield split_views(views[0], settings) if len(views) == 1 else (views[0], views[1])
-
-
-def _shrunk(both: tuple[UInt8, UInt8]) -> Float32:
-    height, width = both[0].shape[:2]
-    size = (_SMALL_PX, max(1, round(_SMALL_PX * height / width)))
-    small = [cv2.resize(to_grey(view), size, interpolation=cv2.INTER_AREA) for view in both]
-    return np.hstack(small).astype(np.float32)
 
 
 def _choose(small: Float32) -> list[int]:

@@ -1,8 +1,7 @@
 """Bundle adjustment of the lenses, the pose of the right camera and every pose of the board.
 
 One solver handles one or two cameras, any lens, and partly visible boards. Board poses are
-eliminated view by view (Schur complement), which leaves each view's information about the shared
-parameters, which the bootstrap reweights.
+eliminated view by view (Schur complement); the bootstrap reweights what is left of each view.
 
 Ref: Triggs et al. 2000, "Bundle adjustment: a modern synthesis", section 6; Zhang 2000.
 """
@@ -51,14 +50,11 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class RigState:
-    """Everything that is estimated: one or two cameras, the first at the origin of the rig.
-
-    Transforms are float64: (4, 4) of each camera, (V, 4, 4) of the board in each view.
-    """
+    """Everything that is estimated: one or two cameras, the first at the origin of the rig."""
 
     cameras: tuple[CameraIntrinsics, ...]
-    T_camera_rig: tuple[Float64, ...]
-    T_rig_board: Float64
+    T_camera_rig: tuple[Float64, ...]  # (4, 4) of each camera
+    T_rig_board: Float64  # (V, 4, 4), of the board in each view
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,10 +106,7 @@ def solve(
 
 
 def squared_errors(views: Sequence[View], state: RigState) -> tuple[Float64, Float64]:
-    """Return sums of squared pixel errors, and numbers of corners: float64 (V, cameras) each.
-
-    A sum is NaN where a corner is behind the camera.
-    """
+    """Return sums of squared errors, px² (NaN = behind), and numbers of corners: (V, cameras)."""
     corners = _gather(views)
     squares = zip(corners, _squares(corners, state), strict=True)
     sums = [np.bincount(seen.view, each, len(views)) for seen, each in squares]
@@ -151,10 +144,7 @@ def _gather(views: Sequence[View]) -> list[_Corners]:
 
 
 def _linearise(corners: Sequence[_Corners], state: RigState) -> Float64:
-    """Return the normal equations JᵀJ of each view, float64 (V, P + 7, P + 7).
-
-    Columns of J: the shared parameters, the pose of the board, and the error itself.
-    """
+    """Return JᵀJ of each view, (V, P + 7, P + 7): shared parameters, pose of the board, error."""
     size, at = len(_prior(state)[0]), 0
     normals = np.zeros((len(state.T_rig_board), size + _POSE + 1, size + _POSE + 1))
     for camera, T, seen in zip(state.cameras, state.T_camera_rig, corners, strict=True):
@@ -210,8 +200,8 @@ def _cost(corners: Sequence[_Corners], state: RigState, weights: Float64) -> flo
 def _without_poses(normals: Float64, damping: float = 0.0) -> tuple[Float64, Float64, Float64]:
     """Eliminate the pose of the board from the normal equations of each view.
 
-    Returns matrices (V, P, P) and vectors (V, P) of the shared parameters, and (V, 6, P + 1), from
-    which the pose's step follows: the last column less the others times the step of the shared.
+    Returns matrices (V, P, P) and vectors (V, P) of the shared parameters, and (V, 6, P + 1): the
+    step of the pose is the last column less the others times that of the shared parameters.
     """
     P = normals.shape[1] - _POSE - 1
     shared, own = normals[:, :P], normals[:, P:-1]

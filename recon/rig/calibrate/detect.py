@@ -39,17 +39,21 @@ _PREFIX: Final = "DICT_"
 
 
 def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
-    """Find the corners of a board in a grey image; None if fewer than 8, or all on one line.
-
-    A chessboard must be fully visible, a ChArUco board may be partly visible.
-    """
+    """Find the corners of a board, or a part of ChArUco; None if fewer than 8, or on one line."""
     if board.kind == "charuco":
-        numbers, pixels = _find_charuco(grey, board)
+        corners, found_numbers, *_ = cv2.aruco.CharucoDetector(_charuco(board)).detectBoard(grey)
+        if found_numbers is None:
+            return None
+        numbers = np.asarray(found_numbers, dtype=np.int32).ravel()
+        pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
     else:
         found = _find_chessboard(grey, board.inner)
         pixels = np.zeros((0, 2)) if found is None else found
         numbers = np.arange(len(pixels), dtype=np.int32)
-    if not _enough(numbers, board):
+    if len(numbers) < min(_FEWEST_CORNERS, len(board.corners_m)):
+        return None
+    flat = board.corners_m[numbers, :2]
+    if np.linalg.matrix_rank(flat - flat.mean(axis=0), tol=1e-9 * board.square_m) < 2:
         return None
     # The edges of the markers must stay outside the window.
     free = (board.square_m - board.marker_m) / (2 * board.square_m)
@@ -61,8 +65,8 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
 def orient_like(reference: Float64, pixels: Float64, inner: Inner) -> Float64:
     """Reorder the corners (N, 2) of a whole chessboard as in another view of it.
 
-    OpenCV may start at any corner of the board. Of all orders that preserve neighbours, this takes
-    the one that resembles the reference most, up to translation and scale.
+    OpenCV may start at any corner of the board. Of all orders that preserve neighbours, this is the
+    one that resembles the reference most, up to translation and scale.
     """
     columns, rows = inner
     grid = np.arange(columns * rows).reshape(rows, columns)
@@ -103,13 +107,6 @@ def _refine_corners(
     return np.where(lost[..., None], start, refined).reshape(-1, 2).astype(np.float64)
 
 
-def _enough(numbers: Int32, board: CalibrationBoard) -> bool:
-    if len(numbers) < min(_FEWEST_CORNERS, len(board.corners_m)):
-        return False
-    flat = board.corners_m[numbers, :2]
-    return bool(np.linalg.matrix_rank(flat - flat.mean(axis=0), tol=1e-9 * board.square_m) == 2)
-
-
 def _spacing(numbers: Int32, pixels: Float64, board: CalibrationBoard) -> float:
     """Return the smallest distance between neighbouring corners of the board, pixels."""
     columns = board.inner[0]
@@ -135,7 +132,16 @@ def check_chessboard(
     claimed = _sorted(board.inner)
     seen = Counter(_sorted(size) for size in sizes if size is not None)
     if not seen:
-        _check_no_markers([read(n) for n in _spread(range(len(sizes)), _PROBED_MARKERS)], board)
+        probes = [read(n) for n in _spread(range(len(sizes)), _PROBED_MARKERS)]
+        best, counts = _marker_votes(probes)
+        if counts[best] >= _SURE * len(probes):
+            raise CalibrationError(
+                "the images show a board with markers (ChArUco)",
+                got=f"markers of {best.lower()}",
+                expected=str(board),
+                hint=f"try --board charuco:COLUMNSxROWS:SQUARE:MARKER:{best.lower()}, "
+                "counting squares",
+            )
     probed: list[Inner | None] = []
     if 2 * seen.total() < len(sizes):
         # The few detections may be parts of a larger board.
@@ -150,7 +156,17 @@ def check_chessboard(
         larger = any(n > m for n, m in zip(size, claimed, strict=True))
         # If the given board was seen whole, a smaller one is part of it.
         if most >= enough and size != claimed and (larger or not seen[claimed]):
-            raise _wrong_size(size, f"{most} of {counted(voters, 'image')}", board)
+            # A board may be held upright or sideways.
+            columns, rows = size if board.columns <= board.rows else size[::-1]
+            given = f"{board.columns}x{board.rows}"
+            squares = (columns + 1, rows + 1) == (board.columns, board.rows)
+            why = "count inner corners, not squares" if squares else "count the inner corners again"
+            raise CalibrationError(
+                f"the board in the images does not have {given} inner corners",
+                got=f"{columns}x{rows} in {most} of {counted(voters, 'image')}",
+                expected=given,
+                hint=f"{why}, or give --board chess:{columns}x{rows}:…",
+            )
 
 
 def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBoard) -> None:
@@ -169,7 +185,8 @@ def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBo
         raise CalibrationError(
             "markers were found, but not in the layout of this board",
             got=f"marker ids up to {numbers.max()}",
-            expected=f"0 to {_marker_count(board) - 1} for {board.columns}x{board.rows} squares",
+            expected=f"0 to {math.prod(board.squares) // 2 - 1} for {board.columns}x{board.rows} "
+            "squares",
             hint="count squares, not corners; give columns first",
         )
     plain = [size for size in map(_probe_size, probed) if size is not None]
@@ -184,10 +201,7 @@ def check_charuco(count: int, read: Callable[[int], UInt8], board: CalibrationBo
 
 
 def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
-    """Return columns and rows of a grid of inner corners, extended as far as corners are found.
-
-    ``inner`` is the size of the grid ``pixels`` (N, 2), which goes row by row.
-    """
+    """Return columns and rows of a grid of corners (N, 2), extended as far as there are corners."""
     columns, rows = inner
     grid = pixels.reshape(rows, columns, 2)
     usual = float(np.nanmedian(_contrast(grey, grid)))
@@ -248,13 +262,11 @@ def _continue(grey: UInt8, grid: Float64, axis: int, usual: float) -> Float64 | 
 
 
 def _contrast(grey: UInt8, grid: Float64) -> Float64:
-    """Return float64 (R, C), how the diagonal pairs of quadrants of each corner differ.
-
-    Differences within a pair count against it. NaN where a quadrant is outside the image.
-    """
+    """Return float64 (R, C), how diagonal quadrants of each corner differ; NaN = outside."""
     down, across = np.gradient(grid, axis=(0, 1))
     smooth, signs = cv2.blur(grey, (3, 3)), ((1, 1), (-1, -1), (1, -1), (-1, 1))
     a, b, c, d = (_sample(smooth, grid + 0.4 * (p * across + q * down)) for p, q in signs)
+    # Differences within a pair count against it.
     return np.asarray(np.abs(a + b - c - d) - np.abs(a - b) - np.abs(c - d)) / 2
 
 
@@ -266,35 +278,8 @@ def _sample(grey: UInt8, places: Float64) -> Float64:
     return np.where(inside, grey[y, x].astype(np.float64), np.nan)
 
 
-def _check_no_markers(images: Sequence[UInt8], board: CalibrationBoard) -> None:
-    best, votes = _marker_votes(images)
-    if votes[best] >= _SURE * len(images):
-        raise CalibrationError(
-            "the images show a board with markers (ChArUco)",
-            got=f"markers of {best.lower()}",
-            expected=str(board),
-            hint=f"try --board charuco:COLUMNSxROWS:SQUARE:MARKER:{best.lower()}, counting squares",
-        )
-
-
-def _wrong_size(size: Inner, where: str, board: CalibrationBoard) -> CalibrationError:
-    columns, rows = size if board.columns <= board.rows else size[::-1]
-    claimed = f"{board.columns}x{board.rows}"
-    squares = (columns + 1, rows + 1) == (board.columns, board.rows)
-    why = "count inner corners, not squares" if squares else "count the inner corners again"
-    return CalibrationError(
-        f"the board in the images does not have {claimed} inner corners",
-        got=f"{columns}x{rows} in {where}",
-        expected=claimed,
-        hint=f"{why}, or give --board chess:{columns}x{rows}:…",
-    )
-
-
 def dark_rectangles(board: CalibrationBoard) -> Float64:
-    """Return float64 (M, 4), the dark rectangles of a board: x0, y0, x1, y1 in metres.
-
-    The origin is the first inner corner, as in `CalibrationBoard.corners_m`.
-    """
+    """Return float64 (M, 4), dark rectangles: x0, y0, x1, y1, metres from the first corner."""
     columns, rows = board.squares
     # OpenCV's boards have a dark square at the upper left corner, legacy ones at the lower left.
     light = 1 if board.kind == "charuco" and board.legacy and rows % 2 == 0 else 0
@@ -303,32 +288,17 @@ def dark_rectangles(board: CalibrationBoard) -> Float64:
     if board.kind == "chess":
         return np.asarray(np.hstack([low - 1.0, low]) * board.square_m)
     charuco, low = _charuco(board), low * board.square_m
-    markers = [
-        _marker_cells(board, int(number), np.asarray(corners)[:, :2])
-        for number, corners in zip(charuco.getIds().ravel(), charuco.getObjPoints(), strict=True)
-    ]
-    cells = np.concatenate([np.hstack([low, low + board.square_m]), *markers])
-    return np.asarray(cells - board.square_m)
-
-
-def _marker_cells(board: CalibrationBoard, number: int, corners: Float64) -> Float64:
-    """Return float64 (M, 4), dark cells of the marker with the given corners (4, 2), metres."""
+    cells = [np.hstack([low, low + board.square_m])]
     dictionary = _dictionary(board.dictionary)
-    cells = dictionary.markerSize + 2
-    bits = cv2.aruco.generateImageMarker(dictionary, number, cells)
-    rows, columns = np.nonzero(bits == 0)
-    step = board.marker_m / cells
-    low = corners.min(axis=0) + np.stack([columns, rows], axis=1) * step
-    return np.asarray(np.hstack([low, low + step]))
-
-
-def _find_charuco(grey: UInt8, board: CalibrationBoard) -> tuple[Int32, Float64]:
-    """Return the numbers of the corners that are seen, int32 (N,), and their pixels (N, 2)."""
-    corners, numbers, *_ = cv2.aruco.CharucoDetector(_charuco(board)).detectBoard(grey)
-    if numbers is None:
-        return np.zeros(0, dtype=np.int32), np.zeros((0, 2))
-    pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-    return np.asarray(numbers, dtype=np.int32).ravel(), pixels
+    side = dictionary.markerSize + 2  # cells of a marker
+    for number, corners in zip(charuco.getIds().ravel(), charuco.getObjPoints(), strict=True):
+        bits = cv2.aruco.generateImageMarker(dictionary, int(number), side)
+        down, across = np.nonzero(bits == 0)
+        step = board.marker_m / side
+        first = np.asarray(corners)[:, :2].min(axis=0)
+        low = first + np.stack([across, down], axis=1) * step
+        cells.append(np.hstack([low, low + step]))
+    return np.asarray(np.concatenate(cells) - board.square_m)
 
 
 def _find_markers(grey: UInt8, dictionary: str) -> Int32:
@@ -346,10 +316,6 @@ def _dictionaries() -> list[str]:
     return sorted({n[len(_PREFIX) :].upper() for n in dir(cv2.aruco) if n.startswith(_PREFIX)})
 
 
-def _marker_count(board: CalibrationBoard) -> int:
-    return math.prod(board.squares) // 2
-
-
 def _dictionary(name: str) -> Any:
     number = getattr(cv2.aruco, f"{_PREFIX}{name}", None)
     if number is None:
@@ -361,11 +327,11 @@ def _dictionary(name: str) -> Any:
 @lru_cache(maxsize=4)
 def _charuco(board: CalibrationBoard) -> Any:
     dictionary = _dictionary(board.dictionary)
-    if len(dictionary.bytesList) < _marker_count(board):
+    if len(dictionary.bytesList) < math.prod(board.squares) // 2:
         raise SettingsError(
             "dictionary has too few markers for the board",
             got=f"{board.dictionary.lower()} with {len(dictionary.bytesList)}",
-            expected=f"at least {_marker_count(board)}",
+            expected=f"at least {math.prod(board.squares) // 2}",
         )
     size = (board.columns, board.rows)
     charuco = cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)

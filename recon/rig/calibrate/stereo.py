@@ -1,4 +1,8 @@
-"""Stereo calibration from views of a board; views that do not fit are dropped and named."""
+"""Stereo calibration from views of a board, and how sure it is.
+
+Views that do not fit are dropped and named. How sure a fit is shows a bootstrap over its views: a
+resample is one Newton step from the solution, with each view weighted by how often it was drawn.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +16,23 @@ import cv2
 import numpy as np
 
 from recon.core.errors import CalibrationError
-from recon.core.geometry.se3 import exp_so3, invert, log_so3, make_transform
+from recon.core.geometry.se3 import apply, exp_so3, invert, log_so3, make_transform
+from recon.core.progress import tracked
+from recon.core.text import counted
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.arrays import Float64
-from recon.rig.calibrate.bundle import Information, RigState, Sighting, View, solve, squared_errors
+from recon.rig.calibrate.bundle import (
+    Information,
+    RigState,
+    Sighting,
+    View,
+    moved,
+    solve,
+    solve_scaled,
+    squared_errors,
+)
 from recon.rig.settings import CalibrationSettings
-from recon.stereo.rectify.lens import rays_of
+from recon.stereo.rectify.lens import project_into_image, rays_of
 
 Size = tuple[int, int]
 # Half fields of view that are tried for a fisheye lens.
@@ -53,8 +68,6 @@ class StereoFit:
 
 def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSettings) -> StereoFit:
     """Calibrate two cameras: each alone, then all parameters of both together.
-
-    Of views that repeat each other one is used; views that do not fit are dropped.
 
     Ref: Zhang 2000; the lens models are OpenCV's.
     """
@@ -107,17 +120,22 @@ def stereo_of(state: RigState) -> StereoCalibration:
 
 
 def _group_views(views: Sequence[View]) -> list[list[View]]:
-    """Group the views by pose of the board, the view that represents a group first.
-
-    Errors on a still board are mostly the same in every image: repeated views measure nothing new.
-    """
+    """Group the views by pose of the board, the view that represents a group first."""
+    # Errors on a still board are mostly the same in every image: repeats measure nothing new.
     groups: list[list[View]] = []
     for view in views:
         same = next((group for group in groups if _moved(group[0], view) < _STILL), None)
         if same is None:
             groups.append(same := [])
         same.append(view)
-    return [_middle_first(group) for group in groups]
+    ordered = []
+    for group in groups:
+        # First the view that is nearest to a few of the others.
+        some = group[:: max(1, len(group) // 8)]
+        apart = [max(_moved(view, other) for other in some) for view in group]
+        middle = int(np.argmin(apart)) if len(group) > 2 else 0
+        ordered.append([group[middle], *group[:middle], *group[middle + 1 :]])
+    return ordered
 
 
 def _moved(first: View, second: View) -> float:
@@ -133,15 +151,6 @@ def _shift(first: Sighting, second: Sighting) -> float:
         a, b = a[here], b[there]
     # A chessboard turned by 180 degrees looks the same, and its corners may begin at either end.
     return min(_length_rms(a - b), _length_rms(a - b[::-1])) / _length_rms(a - a.mean(axis=0))
-
-
-def _middle_first(group: list[View]) -> list[View]:
-    """Return the group with the view first that is nearest to a few of the others."""
-    if len(group) < 3:
-        return group
-    some = group[:: max(1, len(group) // 8)]
-    middle = int(np.argmin([max(_moved(view, other) for other in some) for view in group]))
-    return [group[middle], *group[:middle], *group[middle + 1 :]]
 
 
 def _check_count(
@@ -225,22 +234,20 @@ def _guess_fisheye(sightings: Sequence[Sighting], size: Size) -> RigState:
 
 
 def _with_poses(camera: CameraIntrinsics, sightings: Sequence[Sighting]) -> RigState:
-    poses = np.stack([_locate_board(camera, seen) for seen in sightings])
-    return RigState((camera,), (np.eye(4),), poses)
-
-
-def _locate_board(camera: CameraIntrinsics, seen: Sighting) -> Float64:
-    rays = rays_of(camera, seen.pixels)
-    known = np.isfinite(rays).all(axis=1)
-    try:
-        done, rotation, shift = cv2.solvePnP(
-            seen.board_m[known], rays[known, :2], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
-    except cv2.error as error:
-        raise CalibrationError("no pose of the board fits", got=error.err) from error
-    if not done or not np.isfinite(shift).all():
-        raise CalibrationError("no pose of the board fits")
-    return make_transform(cv2.Rodrigues(rotation)[0], shift.ravel())
+    poses = []
+    for seen in sightings:
+        rays = rays_of(camera, seen.pixels)
+        known = np.isfinite(rays).all(axis=1)
+        try:
+            done, rotation, shift = cv2.solvePnP(
+                seen.board_m[known], rays[known, :2], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+            )
+        except cv2.error as error:
+            raise CalibrationError("no pose of the board fits", got=error.err) from error
+        if not done or not np.isfinite(shift).all():
+            raise CalibrationError("no pose of the board fits")
+        poses.append(make_transform(cv2.Rodrigues(rotation)[0], shift.ravel()))
+    return RigState((camera,), (np.eye(4),), np.stack(poses))
 
 
 def _join_cameras(left: RigState, right: RigState) -> RigState:
@@ -267,3 +274,119 @@ def _solve_robustly(views: Sequence[View], start: RigState) -> RigState:
 def _view_errors(views: Sequence[View], state: RigState) -> Float64:
     sums, counts = squared_errors(views, state)
     return np.asarray(np.sqrt(sums.sum(axis=1) / counts.sum(axis=1)))
+
+
+_PLACES: Final = (0.2, 0.5, 0.8)  # depth errors are those of a 3 by 3 grid in the left image
+_MIDDLE: Final = 4
+_MATCHED: Final = 0.02  # relative error of matching at the default working distance
+MATCH_SIGMA_PX: Final = 0.25  # assumed matching error, by which depth errors are predicted
+DEPTHS_M: Final = (2.0, 5.0, 10.0, 20.0)  # depths at which the error is predicted
+_RESAMPLES: Final = 500
+CONFIDENCE: Final = 0.95  # confidence level of the intervals
+
+
+@dataclass(frozen=True)
+class DepthError:
+    """Predicted depth error at one distance along the optical axis of the left camera."""
+
+    depth_m: float  # the distance
+    calibration_m: float  # rms error over resamples and image; NaN = the views do not overlap
+    low_m: float  # interval of the error at the image centre; negative = measured too near
+    high_m: float
+    matching_m: float  # error due to matching, with `MATCH_SIGMA_PX`
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """Bootstrap intervals (low, high) of the calibration."""
+
+    focal_px: tuple[float, float]  # of the left focal length
+    baseline_m: tuple[float, float]  # of the baseline
+    rotation_deg: float  # root mean square rotation of the right camera relative to the solution
+    depths: tuple[DepthError, ...]  # predicted depth error at each distance
+    working: DepthError  # the same at the working distance, see `_working_distance`
+
+
+def _resample(fit: StereoFit) -> list[StereoCalibration]:
+    """Return rigs calibrated from bootstrap resamples of the views; failed ones are left out."""
+    rng = np.random.default_rng(0)
+    count, info = len(fit.views), fit.information
+    # (V, P): the gradient of each view, corrected for its own effect on the solution, as
+    # (1 - M / W)^-1 v = W (W - M)^-1 v: well conditioned although the parameters differ in size.
+    # Ref: Bell and McCaffrey 2002, "Bias reduction in standard errors" (their jackknife form).
+    whole = info.prior + info.matrices.sum(axis=0)
+    each = zip(info.matrices, info.vectors, strict=True)
+    vectors = np.array([whole @ solve_scaled(whole - matrix, vector) for matrix, vector in each])
+    rigs = []
+    for _ in tracked(range(_RESAMPLES), "samples"):
+        drawn = rng.multinomial(count, np.full(count, 1 / count)).astype(np.float64)
+        A = info.prior + np.tensordot(drawn, info.matrices, axes=1)
+        # At the solution the vectors sum to zero, up to the prior of rational lenses.
+        step = solve_scaled(A, (drawn - 1.0) @ vectors)
+        with suppress(CalibrationError):  # it does not determine a rig
+            rigs.append(stereo_of(moved(fit.state, step)))
+    if len(rigs) < _RESAMPLES / 2:
+        raise CalibrationError(
+            "views do not determine the rig",
+            got=counted(count, "view"),
+            hint="take more, with the board tilted, near and far, and in every image corner",
+        )
+    return rigs
+
+
+def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
+    """Return bootstrap intervals of focal length, baseline, rotation and depth."""
+    rigs = _resample(fit)
+    turns = [rig.T_right_left[:3, :3] @ fit.calibration.T_right_left[:3, :3].T for rig in rigs]
+    cosines = np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)
+    return Spread(
+        focal_px=_interval([rig.left.matrix[0, 0] for rig in rigs]),
+        baseline_m=_interval([rig.baseline_m for rig in rigs]),
+        rotation_deg=float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2)))),
+        depths=tuple(_depth_error(fit, rigs, depth) for depth in DEPTHS_M),
+        working=_depth_error(fit, rigs, _working_distance(fit.calibration, settings)),
+    )
+
+
+def _working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
+    """Return the distance at which depth matters: by default, where matching errs by 2 %."""
+    usual_m = _MATCHED * float(rig.left.matrix[0, 0]) * rig.baseline_m / MATCH_SIGMA_PX
+    return usual_m if settings.working_m is None else settings.working_m
+
+
+def measure_depth(rig: StereoCalibration, left_px: Float64, right_px: Float64) -> Float64:
+    """Return float64 (N,), depth along the left optical axis, from matched raw pixels."""
+    T_left_right = invert(rig.T_right_left)
+    a = rays_of(rig.left, left_px)
+    b = rays_of(rig.right, right_px) @ T_left_right[:3, :3].T
+    # Closest points of the lines l·a and c + m·b, from their normal equations.
+    c = T_left_right[:3, 3]
+    aa, ab, bb = (np.einsum("ni,ni->n", p, q) for p, q in ((a, a), (a, b), (b, b)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray((bb * (a @ c) - ab * (b @ c)) / (aa * bb - ab**2))
+
+
+def _interval(values: list[float]) -> tuple[float, float]:
+    aside = (1 - CONFIDENCE) / 2
+    low, high = np.nanquantile(values, (aside, 1 - aside))
+    return float(low), float(high)
+
+
+def _depth_error(fit: StereoFit, rigs: list[StereoCalibration], depth_m: float) -> DepthError:
+    rig = fit.calibration
+    width, height = rig.left.width_px, rig.left.height_px
+    places = np.array([[x * width, y * height] for y in _PLACES for x in _PLACES])
+    xyz = rays_of(rig.left, places) * depth_m
+    right_px = project_into_image(rig.right, apply(rig.T_right_left, xyz))
+    shared = np.asarray(np.isfinite(right_px).all(axis=1))
+    focal_px = float(rig.left.matrix[0, 0])
+    matching_m = depth_m**2 * MATCH_SIGMA_PX / (focal_px * rig.baseline_m)
+    if not shared[_MIDDLE]:
+        return DepthError(depth_m, np.nan, np.nan, np.nan, matching_m)
+    seen = places[shared], right_px[shared]
+    errors = np.array([measure_depth(other, *seen) - depth_m for other in rigs])
+    middle = errors[:, int(shared[:_MIDDLE].sum())]
+    low_m, high_m = _interval(list(middle))
+    # NaN: the lens of a resample may not be invertible at the image border.
+    rms_m = float(np.sqrt(np.nanmean(errors**2)))
+    return DepthError(depth_m, rms_m, low_m, high_m, matching_m)

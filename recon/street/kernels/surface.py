@@ -93,7 +93,6 @@ def describe_hits(
 
 
 MAX_TAPS = 8
-
 # Large odd constants, one per axis, and the two multipliers of the murmur3 finaliser.
 _X, _Y, _Z, _S = 0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93
 _M1, _M2 = 0xFF51AFD7ED558CCD, 0xC4CEB9FE1A85EC53

@@ -15,10 +15,13 @@ import yaml
 from recon.core.errors import CalibrationError, FormatError, ReconError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
-from recon.io.cameras.calibration import read_calibration
+from recon.io.cameras.calibration import (
+    read_calibration,
+    read_recon_calibration,
+    write_recon_calibration,
+)
 from recon.io.cameras.kitti import list_kitti_cameras, read_kitti_calib, read_kitti_offset
 from recon.io.cameras.opencv_yaml import read_opencv_calibration, write_opencv_calibration
-from recon.io.cameras.recon_yaml import read_recon_calibration, write_recon_calibration
 from recon.io.cameras.ros import camera_info_paths, read_kalibr, write_camera_info, write_kalibr
 from recon.io.images.image import write_image
 from recon.sources.one_pair import read_pair_input

@@ -12,7 +12,6 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from recon.core.errors import FormatError, OutputError, ShapeError
-from recon.io.images import video
 from recon.io.images.disparity import (
     fitting_scale,
     read_disparity_png,
@@ -28,7 +27,7 @@ from recon.io.images.image import (
     read_levels,
     write_image,
 )
-from recon.io.images.video import open_video
+from recon.sources.video import open_video
 from tests.sources.drives import write_video
 
 NAN = float("nan")
@@ -265,9 +264,9 @@ def test_frames_of_some_numbers_are_decoded_and_videos_of_too_many_pixels_refuse
     assert picked[1][0] - picked[0][0] == pytest.approx(0.2)
     with pytest.raises(FormatError, match=r"a\.avi: .*to its end \(got 4 frames, expected 4"):
         list(opened.pick([4]))
-    monkeypatch.setattr(video, "MAX_MEGAPIXELS", 512e-6)
+    monkeypatch.setattr("recon.sources.video.MAX_MEGAPIXELS", 512e-6)
     assert open_video(clip).frames == 4
-    monkeypatch.setattr(video, "MAX_MEGAPIXELS", 511e-6)
+    monkeypatch.setattr("recon.sources.video.MAX_MEGAPIXELS", 511e-6)
     with pytest.raises(FormatError, match=r"too many pixels \(got 32x16"):
         open_video(clip)
 

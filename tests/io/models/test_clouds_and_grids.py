@@ -40,15 +40,17 @@ from recon.core.values import (
     PointCloud,
     join_clouds,
 )
-from recon.io.models.copc import write_copc
-from recon.io.models.e57 import write_e57
-from recon.io.models.geotiff import RasterPlace, write_geotiff
-from recon.io.models.las import check_crs, check_inside, write_las
-from recon.io.models.nav2 import read_grid, write_nav2, write_nav2_costs
-from recon.io.models.npz import write_npz
+from recon.io.models.columns import write_npz, write_pcd
+from recon.io.models.las import check_crs, check_inside, write_copc, write_e57, write_las
 from recon.io.models.octomap import KEY_LIMIT, octomap_pieces, read_octomap, write_octomap_tiles
-from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import read_ply, write_ply
+from recon.io.models.rasters import (
+    RasterPlace,
+    read_grid,
+    write_geotiff,
+    write_nav2,
+    write_nav2_costs,
+)
 from recon.io.models.ros_bag import header, points, write_bag
 from tests.scenery.octomaps import write_octomap
 

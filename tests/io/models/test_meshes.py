@@ -14,9 +14,7 @@ import pytest
 from recon.core.errors import FormatError, OutputError
 from recon.core.values import PointCloud, RectifiedCamera, Texture, TriangleMesh
 from recon.io.images.image import write_image
-from recon.io.models import open3d_meshes
-from recon.io.models.mesh import MESH_SUFFIXES, read_mesh, write_glb, write_mesh
-from recon.io.models.mlp import Photo, write_mlp
+from recon.io.models.mesh import MESH_SUFFIXES, Photo, read_mesh, write_glb, write_mesh, write_mlp
 from recon.io.models.ply import write_ply
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], dtype=np.float32)
@@ -101,7 +99,7 @@ def test_junk_and_missing_files_are_refused_quietly(tmp_path, suffix, capfd):
     with pytest.raises(FormatError):
         read_mesh(tmp_path / f"junk{suffix}")
     with pytest.raises(OutputError):
-        open3d_meshes.write_mesh(tmp_path / "none" / "a.stl", MESH)
+        write_mesh(tmp_path / f"junk{suffix}" / "a.stl", MESH)
     assert capfd.readouterr().out == ""
 
 

@@ -7,14 +7,17 @@ import pytest
 
 from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
-from recon.rig.calibrate import result
 from recon.rig.calibrate.board_views import BoardViews
-from recon.rig.calibrate.bootstrap import measure_spread
-from recon.rig.calibrate.stereo import calibrate_stereo
-from recon.rig.calibrate.verdict import judge_calibration, verdict_of_calibration
+from recon.rig.calibrate.stereo import calibrate_stereo, measure_spread
+from recon.rig.calibrate.verdict import (
+    describe_calibration,
+    judge_calibration,
+    verdict_of_calibration,
+    write_calibration,
+)
 from recon.rig.settings import CalibratedSettings, CalibrationSettings
 from recon.rig.written import CalibrationForm
-from recon.sources.image_names import ImagePairs
+from recon.sources.images import ImagePairs
 
 SIZE = (640, 480)
 
@@ -26,7 +29,7 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     seen = BoardViews(tuple(views), {}, (), SIZE, 14, parse_board(CHESS))
     spread = measure_spread(fit, settings)
     config = CalibratedSettings(calibration=settings)
-    run = result.describe_calibration(seen, fit, spread, config)
+    run = describe_calibration(seen, fit, spread, config)
     found = run.summary
     assert found["baseline_squares"] == pytest.approx(rig.baseline_m / 0.025, rel=0.01)
     assert 0.05 < found["epipolar_px"] < found["epipolar_95_px"] < 0.5
@@ -41,7 +44,7 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     assert found["depth_error_cm"]["2"]["high"] == pytest.approx(100 * spread.depths[0].high_m)
     found["verdict"] = "good"
     for form in get_args(CalibrationForm):
-        files = result.write_calibration(tmp_path / form / "rig.yaml", run, form)
+        files = write_calibration(tmp_path / form / "rig.yaml", run, form)
         read = read_calibration(files[0], *SIZE)
         assert read.baseline_m == pytest.approx(fit.calibration.baseline_m)
 

@@ -9,9 +9,14 @@ from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import angle_rad, apply
 from recon.core.values import StereoCalibration
 from recon.rig.calibrate import stereo
-from recon.rig.calibrate.bootstrap import Spread, measure_depth, measure_spread
 from recon.rig.calibrate.bundle import Sighting, View
-from recon.rig.calibrate.stereo import StereoFit, calibrate_stereo
+from recon.rig.calibrate.stereo import (
+    Spread,
+    StereoFit,
+    calibrate_stereo,
+    measure_depth,
+    measure_spread,
+)
 from recon.rig.settings import CalibrationSettings
 from recon.stereo.rectify.lens import project_raw, rays_of
 

@@ -1,15 +1,17 @@
-"""Nav2 (ROS) maps: a PGM image and a YAML file that describes it.
+"""Maps from above: for Nav2 (ROS) an image and YAML, and as GeoTIFF (extra ``survey``).
 
-Ref: https://docs.nav2.org/configuration/packages/configuring-map-server.html (mode ``trinary``):
-the occupancy of a pixel is ``(255 - value) / 255``; above ``occupied_thresh`` the cell is
-occupied, below ``free_thresh`` free, else unknown. The first row of the image has the largest y.
-In mode ``scale``, pixels that are not opaque are unknown, and those between the thresholds have
-costs from 0 to 100 in proportion.
+Ref: https://docs.nav2.org/configuration/packages/configuring-map-server.html (mode ``trinary``: the
+occupancy of a pixel is ``(255 - value) / 255``; the first row has the largest y; mode ``scale``:
+pixels that are not opaque are unknown, others have costs from 0 to 100 between the thresholds).
 """
 
 from __future__ import annotations
 
 import re
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +19,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from recon.core.errors import FormatError
+from recon.core.errors import FormatError, OutputError, require
 from recon.core.text import counted
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import UInt8
@@ -25,6 +27,7 @@ from recon.io.atomic import atomic_path, write_bytes, write_text
 from recon.io.fields import read_yaml
 from recon.io.files import StrPath, read_bytes, reader
 from recon.io.images.image import encode_image
+from recon.io.models.las import check_crs
 
 _OCCUPIED_THRESH: Final = 0.65
 # With the common 0.25, the grey level of unknown (205, occupancy 0.196…) would be read as free.
@@ -72,13 +75,14 @@ def _describe(image: Path, mode: str, grid: OccupancyGrid, thresholds: tuple[flo
     # Size and turn of a pixel, and the centre of the first one: gdal.org, raster/wld.html.
     side_m, (x_m, y_m) = grid.resolution_m, grid.origin_m
     world = (side_m, 0, 0, -side_m, x_m + side_m / 2, y_m + (len(grid.cells) - 0.5) * side_m)
-    text = "".join(f"{_shortest(number)}\n" for number in world)
+    # Without the rounding of a product: -64.6, where -646 · 0.1 is just below.
+    text = "".join(f"{number:.12g}\n" for number in world)
     write_text(image.with_suffix(".wld"), text)
     described = {
         "image": image.name,
         "mode": mode,
-        "resolution": float(_shortest(grid.resolution_m)),
-        "origin": [*(float(_shortest(place)) for place in grid.origin_m), 0.0],
+        "resolution": float(f"{side_m:.12g}"),
+        "origin": [float(f"{x_m:.12g}"), float(f"{y_m:.12g}"), 0.0],
         "negate": 0,
         "occupied_thresh": thresholds[0],
         "free_thresh": thresholds[1],
@@ -103,11 +107,6 @@ def read_grid(path: StrPath) -> OccupancyGrid:
     return OccupancyGrid(
         np.ascontiguousarray(cells[::-1]), float(fields["resolution"]), (float(x), float(y))
     )
-
-
-def _shortest(number: float) -> str:
-    """Return a number without the rounding of a product: -64.6, where -646 · 0.1 is just below."""
-    return f"{number:.12g}"
 
 
 def _fields(path: Path) -> dict[str, Any]:
@@ -141,3 +140,87 @@ def _read_pgm(path: Path) -> UInt8:
         raise FormatError(what, got=got, expected=f"{rows * columns}")
     pixels: NDArray[np.uint8] = np.frombuffer(body, np.uint8)
     return pixels.reshape(rows, columns)
+
+
+_EXTRA: Final = "survey"
+_BLOCK_PX: Final = 256  # a multiple of 16, by the specification
+_MOST_CELLS: Final = 4_000_000_000  # 6 by 6 km at 0.1 m
+
+
+@dataclass(frozen=True)
+class RasterPlace:
+    """The cells of a raster: north is up, rows are counted from there."""
+
+    cell_m: float  # edge of a cell
+    west: int  # the first column, in cells from the origin
+    north: int  # the end of the first row, in cells from the origin
+    columns: int
+    rows: int
+
+    def cells_of(self, xy_m: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the rows and columns of points (N, 2), metres east and north."""
+        column, row = np.floor(xy_m / self.cell_m).astype(np.int64).T
+        return self.north - 1 - row, column - self.west
+
+    def centres(self, row: int, column: int, shape: tuple[int, int]) -> NDArray[np.float64]:
+        """Return (rows, columns, 2): metres east and north of a block that begins at a cell."""
+        rows, columns = np.indices(shape)
+        east, north = column + columns + self.west + 0.5, self.north - row - rows - 0.5
+        return np.stack([east, north], axis=-1) * self.cell_m
+
+
+class RasterFile:
+    """An open GeoTIFF."""
+
+    def __init__(self, dataset: Any, window: Any, place: RasterPlace) -> None:
+        self._dataset, self._window, self.place = dataset, window, place
+
+    def read(self, row: int, column: int, shape: tuple[int, int]) -> NDArray[Any]:
+        """Return a block (bands, rows, columns)."""
+        window = self._window(column, row, shape[1], shape[0])
+        return np.asarray(self._dataset.read(window=window))
+
+    def write(self, row: int, column: int, block: NDArray[Any]) -> None:
+        """Write a block (bands, rows, columns) that begins at a cell."""
+        window = self._window(column, row, block.shape[2], block.shape[1])
+        self._dataset.write(block, window=window)
+
+
+@contextmanager
+def write_geotiff(
+    path: StrPath, place: RasterPlace, *, colours: bool, crs: str | None
+) -> Iterator[RasterFile]:
+    """Open a GeoTIFF to be written: float32 with NaN where nothing is known, or colours with alpha.
+
+    Only what is written takes room; the file appears when all is done. A raster that is too large
+    is an `OutputError`.
+
+    Ref: OGC 19-008r4, "OGC GeoTIFF Standard", 2019.
+    """
+    rasterio = require("rasterio", extra=_EXTRA)
+    if place.columns * place.rows > _MOST_CELLS:
+        got, expected = f"{place.columns} x {place.rows} cells", f"at most {_MOST_CELLS:g} cells"
+        raise OutputError("the raster is too large", where=path, got=got, expected=expected)
+    kind: dict[str, Any] = {"count": 1, "dtype": "float32", "nodata": float("nan")}
+    if colours:
+        kind = {"count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "yes"}
+    west_m, north_m = place.west * place.cell_m, place.north * place.cell_m
+    with atomic_path(path) as temporary:
+        with rasterio.open(
+            temporary, "w+", driver="GTiff", width=place.columns, height=place.rows,
+            transform=rasterio.Affine(place.cell_m, 0, west_m, 0, -place.cell_m, north_m),
+            crs=None if crs is None else check_crs(crs).to_wkt(), tiled=True, blockxsize=_BLOCK_PX,
+            blockysize=_BLOCK_PX, compress="deflate", bigtiff="if_safer", sparse_ok=True, **kind,
+        ) as dataset:  # fmt: skip
+            yield RasterFile(dataset, rasterio.windows.Window, place)
+            written = _checksums(dataset)
+        # What is left is written when the file is closed, without an error if there is no room.
+        whole = False
+        with suppress(rasterio.errors.RasterioIOError), rasterio.open(temporary) as dataset:
+            whole = _checksums(dataset) == written
+        if not whole:
+            raise OSError("parts of it are missing")
+
+
+def _checksums(dataset: Any) -> list[int]:
+    return [zlib.crc32(dataset.read(window=at).tobytes()) for _, at in dataset.block_windows(1)]
