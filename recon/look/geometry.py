@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.values import RectifiedCamera
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float32, Float64
 from recon.look.sample import LARGEST_SKEW, MIN_FEATURES, Sample, Shifted, align_features, time_skew
 from recon.stereo.rectify.epipolar import EpipolarAlignment, align_epipolar
 from recon.stereo.rectify.features import PairFeatures, inspect_features, pool_features
@@ -159,7 +159,7 @@ def measure_rigidity(
         seen = one.features
         aligned = align_epipolar(seen.left_uv, seen.right_uv, camera)
         if aligned is not None and 2 * aligned.agreeing > len(seen):
-            right = seen.right_uv[:, 1]
+            right: Float32 | Float64 = seen.right_uv[:, 1]
             if common is not None:
                 right = common.turned_rows(seen.right_uv, camera)
             left_px = float(np.median(right - seen.left_uv[:, 1]))

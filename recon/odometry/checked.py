@@ -77,14 +77,13 @@ class CheckedOdometry:
         if health.sigma_m > most_sigma_m(length_m, self._scale):
             return [f"the motion is known to {health.sigma_m:.2g} m only"]
         found = explain_motion(*views, T_before_now, camera)
-        patches = counted(found.informative, "patch", "patches")
-        if found.informative >= _MIN_TELLING:
-            if found.ratio >= MIN_RATIO:
-                return []
-            return [f"only {100 * found.ratio:.0f} % of {patches} of the image moved like that"]
+        telling = found.informative >= _MIN_TELLING
         # A visual motion has passed the test of its uncertainty; any other has no other evidence.
-        if np.isfinite(health.sigma_m):
+        if found.ratio >= MIN_RATIO if telling else np.isfinite(health.sigma_m):
             return []
+        patches = counted(found.informative, "patch", "patches")
+        if telling:
+            return [f"only {100 * found.ratio:.0f} % of {patches} of the image moved like that"]
         return [f"only {patches} of the image can distinguish motions"]
 
 

@@ -54,7 +54,7 @@ class OnnxNetwork:
         # The exceptions of onnxruntime have no common base class.
         state = vars(runtime.capi.onnxruntime_pybind11_state).values()
         own = [kind for kind in state if isinstance(kind, type) and issubclass(kind, Exception)]
-        self._errors = (*own, RuntimeError, ValueError, TypeError)
+        self._errors: tuple[type[Exception], ...] = (*own, RuntimeError, ValueError, TypeError)
         options = runtime.SessionOptions()
         options.intra_op_num_threads = threads or 0
         options.log_severity_level = 4  # fatal only: lesser errors arrive as exceptions

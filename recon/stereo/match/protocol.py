@@ -56,7 +56,7 @@ class CheckedMatcher:
     def match(self, pair: RectifiedPair) -> Disparity:
         where = f"matcher {self._name!r}"
         with calling(MatchingError, "the matcher fails", where=where):
-            found = self._matcher.match(pair)
+            found: Any = self._matcher.match(pair)
         if not isinstance(found, Disparity):
             what, hint = (
                 "the matcher returns no Disparity",
