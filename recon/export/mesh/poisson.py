@@ -118,13 +118,7 @@ def reconstruct_mesh(
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
     cloud = oriented(cloud, viewpoint_m)
-    depth = settings.depth
-    if depth is None:  # the smallest whose cells are no wider than the settings allow
-        cell_m = settings.cell_spacings * typical_spacing_m(cloud.xyz)
-        extent_m = float(np.ptp(cloud.xyz, axis=0).max()) * _OCTREE_SCALE
-        depth = settings.max_depth
-        if cell_m * 2**depth > extent_m:
-            depth = int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, depth))
+    depth = settings.depth or _fitting_depth(cloud.xyz, settings)
     normals = np.asarray(cloud.normals)
     vertices, faces, density = screened_poisson(
         cloud.xyz, normals, depth, _OCTREE_SCALE, settings.point_weight
@@ -210,6 +204,15 @@ def oriented(cloud: PointCloud, viewpoint_m: Point | None = None) -> PointCloud:
         away = np.einsum("ij,ij->i", normals, np.asarray(viewpoint_m) - cloud.xyz) < 0
         normals = np.where(away[:, None], -normals, normals)
     return replace(cloud, normals=normals)
+
+
+def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
+    """Return the smallest octree depth whose cells are no wider than the settings allow."""
+    cell_m = settings.cell_spacings * typical_spacing_m(xyz)
+    extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
+    if cell_m * 2**settings.max_depth <= extent_m:
+        return settings.max_depth
+    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, settings.max_depth))
 
 
 def typical_spacing_m(xyz: Float32) -> float:
