@@ -21,9 +21,8 @@ from recon.core.values import PointCloud, TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Int32
 from recon.export.mesh.cut import drop_small_components, keep_vertices, vertex_normals
 from recon.export.pymeshlab import screened_poisson
-from recon.io.models import open3d_meshes
-from recon.map.kernels.distance import surface_of
 from recon.io.models.mesh import decimate
+from recon.map.kernels.distance import surface_of
 from recon.stereo import open3d_clouds
 
 OVERLAP_M: Final = 3.0

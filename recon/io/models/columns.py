@@ -22,7 +22,6 @@ from recon.core.values.arrays import Float32
 from recon.core.values.cloud import Format
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
-from recon.report.table import Table
 
 Table = NDArray[Any]  # structured, with a field for each column
 Columns = dict[str, NDArray[Any]]
