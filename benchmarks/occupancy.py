@@ -23,7 +23,7 @@ from recon.commands.demo import demo_source
 from recon.commands.evaluate import run_evaluate_occupancy
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.text import plain
+from recon.core.summary import to_json
 
 ASKED: Final = {
     "voxels.precision": 0.9,
@@ -71,7 +71,7 @@ def figures(seed: int, options: argparse.Namespace, runs: Path) -> dict[str, Any
     run_map(
         demo_source(config), config, MapOptions(audit=False, command="demo", out=out, mesh=False)
     )
-    found = plain(run_evaluate_occupancy(out).metrics)
+    found = to_json(run_evaluate_occupancy(out).metrics)
     flat = {
         f"{part}.{name}": value
         for part, values in found.items()

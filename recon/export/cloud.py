@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
-from recon.export.product import Made, Order
+from recon.export.product import Made, Order, PointFigures
 from recon.io.models.npz import write_npz
 from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import write_ply_tiles
@@ -23,6 +24,13 @@ _GROWTH: Final = 1.25
 _MUCH: Final = 0.02  # share of the points left out without a word; a busy street has less
 
 
+@dataclass(frozen=True)
+class CloudFigures(PointFigures):
+    """The fused cloud, without what moved."""
+
+    points_removed: int
+
+
 def cloud_product(order: Order, path: Path) -> Made:
     """Write the fused cloud, and ``removed.ply`` beside it with what moved."""
     return export_cloud(order.placed.tiles, path, path.with_name("removed.ply"))
@@ -31,7 +39,7 @@ def cloud_product(order: Order, path: Path) -> Made:
 def pcd_product(order: Order, path: Path) -> Made:
     """Write the fused cloud for PCL."""
     clouds = (tile.cloud for tile in order.placed.tiles)
-    return Made({"points": write_pcd(path, clouds)})
+    return Made(PointFigures(write_pcd(path, clouds)))
 
 
 def arrays_product(order: Order, path: Path) -> Made:
@@ -53,7 +61,7 @@ def arrays_product(order: Order, path: Path) -> Made:
         (tile.cloud.arrays for tile in order.placed.tiles if len(tile.cloud)),
         {name: np.concatenate(each) for name, each in whole.items()},
     )
-    return Made({"points": points})
+    return Made(PointFigures(points))
 
 
 def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
@@ -67,8 +75,7 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Made:
     if removed is not None and tiles.config.fusion.remove_moving:
         moved = (tile.removed for tile in tiles)
         left_out = write_ply_tiles(removed, moved, frame="map")
-    figures = {"points": points, "points_removed": left_out}
-    return Made(figures, _doubts(tiles, points, left_out), sample.cloud())
+    return Made(CloudFigures(points, left_out), _doubts(tiles, points, left_out), sample.cloud())
 
 
 def even_sample(tiles: Tiles) -> PointCloud:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from recon.core.errors import FormatError, MeshingError
+from recon.core.summary import optional
 from recon.core.values import Disparity, PointCloud, RectifiedCamera, Texture, TriangleMesh
 from recon.core.values.arrays import UInt8
 from recon.core.values.camera import depth_from_disparity, project
@@ -19,6 +20,7 @@ from recon.export.mesh.coverage import check_coverage, mesh_coverage
 from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.pieces import WHOLE
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
+from recon.export.product import ProductFigures
 from recon.io.images.disparity import fitting_scale, write_disparity_png, write_pfm
 from recon.io.images.image import read_image, write_image
 from recon.io.models.mesh import write_mesh
@@ -130,9 +132,25 @@ def write_surface(
     write_mlp(path.with_suffix(".mlp"), {"mesh": path, "cloud": cloud}, frame, photos)
 
 
+@dataclass(frozen=True)
+class PairMeshFigures(ProductFigures):
+    """The surface of a cloud."""
+
+    points: int
+    vertices: int
+    faces: int
+    mesh_coverage: float | None = optional()  # fraction of the measured points on it, of a pair
+
+    @property
+    def text(self) -> str:
+        covered = self.mesh_coverage
+        on = "" if covered is None else f", on it {100 * covered:.0f} % of the measured points"
+        return f"{self.faces:,} faces{on}"
+
+
 def mesh_cloud(
     cloud: PointCloud, camera: RectifiedCamera | None, settings: MeshSettings, run: Path
-) -> tuple[TriangleMesh, dict[str, Any]]:
+) -> tuple[TriangleMesh, PairMeshFigures]:
     """Mesh a cloud in one piece, as its camera saw it if it is that of a pair; with figures.
 
     ``run`` is the folder of the pair, in which its left image may be.
@@ -141,13 +159,12 @@ def mesh_cloud(
         what, hint = "only the surface of a pair is closed behind", "name the folder of its run"
         raise MeshingError(what, got=f"mesh.pair_solid_m={settings.pair_solid_m:g}", hint=hint)
     if camera is None:
-        mesh, covered = reconstruct_mesh(cloud, settings), {}
+        mesh, coverage = reconstruct_mesh(cloud, settings), None
     else:
         mesh = _surface(cloud, camera, settings, _photo_of(run, camera))
-        covered = {"mesh_coverage": _coverage(mesh, cloud, settings)}
-    sizes = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    warnings = [line for share in covered.values() for line in check_coverage(share)]
-    return mesh, {**sizes, **covered, "warnings": warnings}
+        coverage = _coverage(mesh, cloud, settings)
+    sizes = (len(cloud), len(mesh.vertices), len(mesh.faces))
+    return mesh, PairMeshFigures(*sizes, coverage)
 
 
 def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from recon.core.errors import OutputError
+from recon.core.summary import Figures
 from recon.core.values.arrays import Float64
 from recon.export.images import DriveImages, open_images
 from recon.export.mesh.poisson import MeshSettings
@@ -48,11 +49,32 @@ class Order:
         return None if self.survey is None else self.survey.system
 
 
+@dataclass(frozen=True)
+class ProductFigures(Figures):
+    """Base of what is counted and measured of a product."""
+
+    @property
+    def text(self) -> str:
+        """The most important ones in a few words."""
+        return ""
+
+
+@dataclass(frozen=True)
+class PointFigures(ProductFigures):
+    """A cloud."""
+
+    points: int
+
+    @property
+    def text(self) -> str:
+        return f"{self.points:,} points"
+
+
 @dataclass(frozen=True, eq=False)
 class Made:
-    """What is left of a written product: figures of the summary, warnings, what a report shows."""
+    """What is left of a written product: its figures, warnings, what a report shows."""
 
-    figures: dict[str, Any]
+    figures: ProductFigures
     warnings: Sequence[str] = ()
     value: Any = field(default=None, repr=False)
 

@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool
 from recon.export.occupancy import GROUND_SHARE, grounds
-from recon.export.product import Made, Order
+from recon.export.product import Made, Order, PointFigures
 from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
 from recon.io.models.las import AreGround, write_las
@@ -25,7 +25,7 @@ def las_product(order: Order, path: Path, write: Callable[..., int] = write_las)
     # A hundredth of a voxel, as a decimal: a millimetre on a road.
     step_m = 10.0 ** math.floor(math.log10(order.placed.tiles.config.fusion.voxel_m) - 2.0)
     how = {"step_m": step_m, "ground": _ground_of(order.placed)}
-    return Made({"points": write(path, clouds, order.T_survey_map, order.crs, **how)})
+    return Made(PointFigures(write(path, clouds, order.T_survey_map, order.crs, **how)))
 
 
 def copc_product(order: Order, path: Path) -> Made:
@@ -36,7 +36,7 @@ def copc_product(order: Order, path: Path) -> Made:
 def e57_product(order: Order, path: Path) -> Made:
     """Write the cloud as E57, perhaps where a survey says."""
     clouds = (tile.cloud for tile in order.placed.tiles)
-    return Made({"points": write_e57(path, clouds, order.T_survey_map, order.crs)})
+    return Made(PointFigures(write_e57(path, clouds, order.T_survey_map, order.crs)))
 
 
 def _ground_of(placed: PlacedMap) -> AreGround:
