@@ -234,8 +234,9 @@ def audit(
         announce(drive, quiet=shared.quiet, verbose=verbose)
         found = run_audit(drive, settings, mend=mend, out=out)
     summary = found.summary
-    if not shared.json:  # which has no folder: it is written before there is one
-        summary = replace(summary, out=None if out is None else str(out))
+    summary = replace(summary, path=str(source))
+    if out is not None and not shared.json:
+        summary = replace(summary, out=str(out))
     print_summary(summary, as_json=shared.json, verbose=verbose)
 
 

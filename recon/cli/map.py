@@ -146,10 +146,11 @@ def map_(
             shown: RunSummary = run_remove(into, remove, settings, options)
         else:
             drive, options = open_drive(options, settings, shared)
-            if into is None:
-                shown = run_map(drive, settings, options).summary
-            else:
-                shown = run_map_into(into, drive, settings, options)
+            shown = (
+                run_map(drive, settings, options).summary
+                if into is None
+                else run_map_into(into, drive, settings, options)
+            )
     shared.show(shown)
 
 

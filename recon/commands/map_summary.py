@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import Final
 
 from typing_extensions import Self
@@ -60,7 +61,7 @@ class UsualProducts(Figures):
         )
 
     def rows(self, voxel_m: float | None = None) -> Rows:
-        voxels = "" if voxel_m is None else f", voxels of {metres(voxel_m)}"
+        voxels = "" if voxel_m is None else f", voxels of {voxel_m:g} m"
         return [
             ("cloud", PRODUCTS["cloud"].name, self.cloud.text + voxels),
             ("grid", PRODUCTS["grid"].name, self.grid.text),
@@ -115,7 +116,7 @@ class MapSummary(RunSummary):
         rate = () if self.fps is None else (f"{self.fps:.1f} frames/s",)
         live = self.read.live
         late_ms = None if live is None else live.latency_ms.p95
-        poses = () if late_ms is None else (f"95 % of the poses within {late_ms:.0f} ms",)
+        poses = () if late_ms is None else (f"95 % of poses in {late_ms:.0f} ms",)
         return [
             (f"map of {counted(self.frames, 'frame')}{doubted}, {path}",),
             *self.folder_row(),
@@ -129,10 +130,10 @@ class MapSummary(RunSummary):
         """Return how far path and surface are off the truth, as far as that is known."""
         parts = []
         if (path := self.trajectory) is not None:
-            parts.append(f"drift {path.t_rel_percent:.2g} %, path off {metres(path.ate_m)} (RMS)")
+            parts.append(f"drift {path.t_rel_percent:.2g} %, ATE {metres(path.ate_m)} (RMS)")
         if (surface := self.map) is not None:
-            near = metres(surface.threshold_m)
-            parts.append(f"{100 * surface.precision:.0f} % of the points within {near}")
+            near = f"within {surface.threshold_m:g} m"
+            parts.append(f"{100 * surface.precision:.0f} % of the points {near}")
         return [("accuracy", "; ".join(parts))] if parts else []
 
 
@@ -218,7 +219,7 @@ class ExportSummary(RunSummary):
         made = [(name, PRODUCTS[name].name, one.text) for name, one in self.products.items()]
         most = _MOST_ROWS if self.survey is None else _MOST_ROWS - 1
         shown, others = (made, []) if len(made) <= most else (made[: most - 1], made[most - 1 :])
-        rest = ", ".join(name for name, *_ in others)
+        rest = shorten(", ".join(name for name, *_ in others), 60, placeholder=" …")
         place = [] if self.survey is None else [("survey", self._placed(self.survey))]
         return [
             (f"{counted(len(made), 'product')} of {self.run}",),

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 _FORM: Final = "json"  # key of the metadata of a field
-_LEFT_OUT, _INLINE, _INLINE_EACH = "left out", "inline", "inline each"
+_LEFT_OUT, _HIDDEN, _INLINE, _INLINE_EACH = "left out", "hidden", "inline", "inline each"
 Rows = list[tuple[str, ...]]
 """What a command says when it is done: a sentence, or a subject, a file or folder, and figures."""
 
@@ -45,6 +45,11 @@ def inline(default: Any = MISSING) -> Any:
 def inline_each() -> Any:
     """Return a field with parts by name, whose keys are among those of the whole."""
     return field(default_factory=dict, metadata={_FORM: _INLINE_EACH})
+
+
+def hidden(default: Any) -> Any:
+    """Return a field for the terminal alone, which is not in the JSON."""
+    return field(default=default, metadata={_FORM: _HIDDEN})
 
 
 def named(key: str) -> Any:
@@ -84,8 +89,8 @@ class RunSummary(Summary):
         """Return the line of what the run cost; none where that is not known."""
         if self.seconds is None:
             return []
-        parts = (f"{self.seconds:.1f} s", *more, f"{self.peak_memory_mb:,.0f} MB of memory at most")
-        return [("cost", ", ".join(parts))]
+        memory = f"{(self.peak_memory_mb or 0.0) / 1e3:.2g} GB of memory"
+        return [("cost", ", ".join((f"{self.seconds:.1f} s", *more, memory)))]
 
     def open_report(self) -> str:
         """Return the command that opens the report."""
@@ -124,5 +129,5 @@ def _items(value: Any) -> Iterator[tuple[str, Any]]:
             parts = part.values() if form == _INLINE_EACH else () if part is None else (part,)
             for each in parts:
                 yield from to_json(each).items()
-        elif form != _LEFT_OUT or part is not None:
+        elif form != _HIDDEN and (form != _LEFT_OUT or part is not None):
             yield one.metadata.get("key", one.name), to_json(part)

@@ -110,7 +110,7 @@ class PairSummary(RunSummary):
     def rows(self) -> Rows:
         found, out = self.cloud, shown_path(self.out or "")
         deep = found.depth_median_m
-        unit = "no unit, since no baseline is known"
+        unit = "up to scale"
         depth = "" if deep is None else f", median depth {metres(deep)}"
         cloud = f"{found.points:,} points" + (f", {unit}" if self.up_to_scale else depth)
         covered = (

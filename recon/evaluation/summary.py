@@ -79,19 +79,18 @@ class MapEvaluation(RunSummary):
     def rows(self) -> Rows:
         found = self.first.metrics
         shown = [
-            (f"at {metres(one.metrics.threshold_m)}", _precision(one))
-            for one in self.by_threshold[:3]
+            (f"at {one.metrics.threshold_m:g} m", _precision(one)) for one in self.by_threshold[:2]
         ]
         beyond = self.beyond_reach
         far = "" if beyond is None else f", {100 * beyond:.0f} % beyond the reference"
         near = f"median {metres(found.median_m)}, 95 % within {metres(found.p95_m)}{far}"
-        pictures = "error.ply and missed.ply, coloured by error"
         again = "the same with --out FOLDER, for clouds coloured by error"
         return [
             (f"{found.points:,} points compared with {found.reference_points:,} of the reference",),
-            *([] if self.out is None else [("folder", self.out, pictures)]),
+            *self.folder_row(),
             ("distance", near),
             *shown,
+            *([] if self.out is None else [("clouds", "error.ply, missed.ply, coloured by error")]),
             *self.cost_row(),
             ("next", again if self.out is None else f"meshlab {shown_path(self.out, 'error.ply')}"),
         ]
@@ -139,7 +138,7 @@ class OccupancyEvaluation(RunSummary):
     metrics: OccupancyMetrics = inline()
 
     def rows(self) -> Rows:
-        found, cell = self.metrics, metres(self.metrics.resolution_m)
+        found, cell = self.metrics, f"{self.metrics.resolution_m:g} m"
         voxels, exact, grid = found.voxels, found.voxels_exact, found.grid
         seen = f"that {counted(found.least_frames, 'frame')} or more saw"
         ious = f"IoU of occupied {_percent(grid.iou_occupied)}, of free {_percent(grid.iou_free)}"

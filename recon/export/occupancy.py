@@ -61,7 +61,7 @@ class GridFigures(ProductFigures):
     @property
     def text(self) -> str:
         sides = (metres(cells * self.resolution_m) for cells in (self.columns, self.rows))
-        return f"{' × '.join(sides)}, cells of {metres(self.resolution_m)}"
+        return f"{' × '.join(sides)}, cells of {self.resolution_m:g} m"
 
 
 @dataclass(frozen=True)

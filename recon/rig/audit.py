@@ -11,7 +11,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError
 from recon.core.progress import stage
-from recon.core.summary import Figures, Rows, RunSummary, inline, optional, shown_path
+from recon.core.summary import Figures, Rows, RunSummary, hidden, inline, optional, shown_path
 from recon.core.text import counted, metres
 from recon.core.values import Disparity, Reason, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
@@ -121,6 +121,7 @@ class AuditSummary(RunSummary):
     findings: Sequence[FindingFigures]
     figures: AuditFigures = inline()
     mended: CorrectedFigures | None = optional()
+    path: str = hidden("")  # of the recording, as it was named
 
     def remarks(self) -> list[tuple[str, str]]:
         return [*super().remarks(), *((one.severity, one.text) for one in self.findings)]
@@ -135,7 +136,11 @@ class AuditSummary(RunSummary):
             (f"{found.source} is {self.verdict}",),
             ("frames", frames + repeated),
             *([] if rms_px is None else [("epipolar", f"error of {rms_px:.2f} px (RMS)")]),
-            *([] if off_m is None else [("depth", f"to {metres(off_m)} at {_SHOWN_AT} m")]),
+            *(
+                []
+                if off_m is None
+                else [("depth", f"± {off_m:.2g} m at {_SHOWN_AT} m (standard deviation)")]
+            ),
             ("rig", f"baseline {metres(found.baseline_m)}, focal length {found.focal_px:.0f} px"),
             *([] if self.mended is None else [("mended", ", ".join(self.mended.files))]),
             *self.folder_row(),
@@ -143,7 +148,7 @@ class AuditSummary(RunSummary):
         ]
 
     def _next(self) -> tuple[str, str]:
-        source = shown_path(self.figures.source)
+        source = shown_path(self.path) if self.path else "SOURCE"
         if self.verdict == "not usable":
             return "next", "repair what is fatal above, or record again"
         if self.mended is not None:

@@ -272,7 +272,9 @@ class Known:
 
 def test_ones_own_matcher_is_a_column_too(quarter, results, tmp_path):
     mine, out = [str(results / "mine")], tmp_path / "run"
-    summary = recon.run_middlebury(str(quarter), matchers=[Known()], results=mine, out=out)
+    summary = recon.run_middlebury(
+        str(quarter), matchers=[Known()], results=mine, out=out
+    ).to_json()
     assert list(summary["matchers"]) == ["known", "mine"]
     weighted = summary["matchers"]["known"]["weighted"]
     assert weighted["all"]["invalid"] == 50

@@ -259,14 +259,14 @@ class LocalizeSummary(RunSummary):
         left = f"{found.frames_coasting} by odometry alone, {found.frames_searching} not yet found"
         first, sigma_m = found.first_fix_frame, found.median_sigma_m
         where = "no frame has a pose" if first is None else f"from frame {first} on"
-        sure = "" if sigma_m is None else f", positions to {metres(sigma_m)} (standard deviation)"
+        sure = "" if sigma_m is None else f", positions ± {metres(sigma_m)}"
         ms = 1e3 * found.seconds_per_frame.p95
         return [
             (f"{tracked} of {self.source} found in {self.map_run}",),
             *self.folder_row(),
             ("poses", "trajectory_tum.txt", where + sure),
             ("others", f"{left}; lost {counted(found.frames_lost, 'time')}"),
-            *self.cost_row(f"95 % of the frames within {ms:.0f} ms"),
+            *self.cost_row(f"95 % of frames in {ms:.0f} ms"),
             ("next", f"recon view {shown_path(self.out or '')}"),
         ]
 

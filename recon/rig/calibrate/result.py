@@ -64,7 +64,7 @@ class CalibrationSummary(RunSummary):
         off = "no common view" if share is None else f"error of {100 * share:.1f} %"
         file = (self.files or [str(Path(out, "calibration.yaml"))])[0]
         again = "take other views as said above, and calibrate again"
-        use = f"recon rectify LEFT RIGHT --calib {shown_path(file)}"
+        use = f"recon audit DRIVE --calib {shown_path(file)}"
         return [
             (f"calibration of {views}, lens {self.model}: {self.verdict}",),
             ("file", ", ".join(self.files or [file])),
