@@ -27,7 +27,7 @@ from recon.export.cloud import CloudFigures
 from recon.export.make import PRODUCTS, Products
 from recon.export.mesh.pieces import WHOLE, MeshFigures
 from recon.export.occupancy import GridFigures, OctomapFigures
-from recon.export.pair import PAIR_CLOUD, PairMeshFigures
+from recon.export.pair import PAIR_CLOUD
 from recon.export.product import ProductFigures
 from recon.look.rig import RigFigures
 from recon.map.drive.drive_loops import LoopFigures
@@ -196,14 +196,6 @@ class PieceSummary(RunSummary):
 
     frames: int
 
-    def rows(self) -> Rows:
-        return [
-            (f"piece of {counted(self.frames, 'frame')}",),
-            *self.folder_row(),
-            *self.cost_row(),
-            ("next", "the command that began the run joins the pieces"),
-        ]
-
 
 @dataclass(frozen=True, kw_only=True)
 class ExportSummary(RunSummary):
@@ -252,7 +244,7 @@ class CloudSummary(RunSummary):
 
     cloud: str  # the file
     run: str | None = optional()  # folder of the run of the pair
-    mesh: PairMeshFigures | None = inline(None)
+    mesh: MeshFigures | None = inline(None)
 
     def rows(self) -> Rows:
         mesh, out = self.mesh, self.out or ""

@@ -85,6 +85,9 @@ class RunSummary(Summary):
     def remarks(self) -> list[tuple[str, str]]:
         return [("warning", text) for text in self.warnings]
 
+    def rows(self) -> Rows:
+        return [*self.folder_row(), *self.cost_row()]
+
     def cost_row(self, *more: str) -> Rows:
         """Return the line of what the run cost; none where that is not known."""
         if self.seconds is None:

@@ -28,10 +28,6 @@ class ColmapFigures(ProductFigures):
     colmap_images: int
     colmap_points: int
 
-    @property
-    def text(self) -> str:
-        return f"{self.colmap_images:,} images, {self.colmap_points:,} points"
-
 
 def colmap_product(order: Order, folder: Path) -> Made:
     """Write a folder with ``images`` and ``sparse/0``, in map axes.

@@ -34,10 +34,6 @@ class BagFigures(ProductFigures):
 
     bag_frames: int
 
-    @property
-    def text(self) -> str:
-        return f"{self.bag_frames:,} frames"
-
 
 def mcap_product(order: Order, folder: Path) -> Made:
     """Write a folder with a bag: transforms, odometry, what each frame saw, cloud, grid, images.

@@ -43,10 +43,6 @@ class NerfstudioFigures(ProductFigures):
 
     nerfstudio_frames: int
 
-    @property
-    def text(self) -> str:
-        return f"{self.nerfstudio_frames:,} frames"
-
 
 def nerfstudio_product(order: Order, folder: Path) -> Made:
     """Write a folder with ``transforms.json`` and what it names, in map axes.

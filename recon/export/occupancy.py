@@ -70,10 +70,6 @@ class OctomapFigures(ProductFigures):
 
     voxels: int
 
-    @property
-    def text(self) -> str:
-        return f"{self.voxels:,} voxels"
-
 
 def grid_product(order: Order, path: Path) -> Made:
     """Write the flat grid as Nav2 reads it, given the path of its YAML file."""

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from recon.core.errors import FormatError, MeshingError
-from recon.core.summary import optional
 from recon.core.values import Disparity, PointCloud, RectifiedCamera, Texture, TriangleMesh
 from recon.core.values.arrays import UInt8
 from recon.core.values.camera import depth_from_disparity, project
@@ -18,9 +17,8 @@ from recon.core.values.cloud import Frame
 from recon.core.values.image import in_colour
 from recon.export.mesh.coverage import check_coverage, mesh_coverage
 from recon.export.mesh.grid import mesh_grid
-from recon.export.mesh.pieces import WHOLE
+from recon.export.mesh.pieces import WHOLE, MeshFigures
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
-from recon.export.product import ProductFigures
 from recon.io.images.disparity import fitting_scale, write_disparity_png, write_pfm
 from recon.io.images.image import read_image, write_image
 from recon.io.models.mesh import write_mesh
@@ -132,25 +130,9 @@ def write_surface(
     write_mlp(path.with_suffix(".mlp"), {"mesh": path, "cloud": cloud}, frame, photos)
 
 
-@dataclass(frozen=True)
-class PairMeshFigures(ProductFigures):
-    """The surface of a cloud."""
-
-    points: int
-    vertices: int
-    faces: int
-    mesh_coverage: float | None = optional()  # fraction of the measured points on it, of a pair
-
-    @property
-    def text(self) -> str:
-        covered = self.mesh_coverage
-        on = "" if covered is None else f", on it {100 * covered:.0f} % of the measured points"
-        return f"{self.faces:,} faces{on}"
-
-
 def mesh_cloud(
     cloud: PointCloud, camera: RectifiedCamera | None, settings: MeshSettings, run: Path
-) -> tuple[TriangleMesh, PairMeshFigures]:
+) -> tuple[TriangleMesh, MeshFigures]:
     """Mesh a cloud in one piece, as its camera saw it if it is that of a pair; with figures.
 
     ``run`` is the folder of the pair, in which its left image may be.
@@ -163,8 +145,12 @@ def mesh_cloud(
     else:
         mesh = _surface(cloud, camera, settings, _photo_of(run, camera))
         coverage = _coverage(mesh, cloud, settings)
-    sizes = (len(cloud), len(mesh.vertices), len(mesh.faces))
-    return mesh, PairMeshFigures(*sizes, coverage)
+    return mesh, MeshFigures(
+        points=len(cloud),
+        vertices=len(mesh.vertices),
+        faces=len(mesh.faces),
+        mesh_coverage=coverage,
+    )
 
 
 def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -55,8 +55,10 @@ class ProductFigures(Figures):
 
     @property
     def text(self) -> str:
-        """The most important ones in a few words."""
-        return ""
+        """The most important ones in a few words: what is counted, by the last word of its name."""
+        counts = ((one.name, getattr(self, one.name)) for one in fields(self))
+        known = ((name.rpartition("_")[2], n) for name, n in counts if isinstance(n, int))
+        return ", ".join(f"{n:,} {word}" for word, n in known)
 
 
 @dataclass(frozen=True)
@@ -64,10 +66,6 @@ class PointFigures(ProductFigures):
     """A cloud."""
 
     points: int
-
-    @property
-    def text(self) -> str:
-        return f"{self.points:,} points"
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ from recon.commands.map_summary import (
     JoinedSummary,
     LinkFigures,
     MapSummary,
-    PieceSummary,
     UsualProducts,
 )
 from recon.core.summary import (
@@ -59,7 +58,6 @@ from recon.export.cloud import CloudFigures
 from recon.export.make import PRODUCTS
 from recon.export.mesh.pieces import MeshFigures
 from recon.export.occupancy import GridFigures, OctomapFigures
-from recon.export.pair import PairMeshFigures
 from recon.export.product import PointFigures
 from recon.look.rig import RigFigures
 from recon.map.localize.sequence import FrameSeconds, LocalizedFigures, LocalizeSummary
@@ -207,7 +205,6 @@ SUMMARIES: dict[str, Summary] = {
         made=replace(MADE, mesh=MeshFigures()),
     ),
     "live": replace(MAP, read=LIVE),
-    "piece": PieceSummary(frames=1000, **COST),
     "merge": JOINED,
     "localize": LOCALIZED,
     "localize in another place": replace(
@@ -216,7 +213,9 @@ SUMMARIES: dict[str, Summary] = {
     "export": EXPORTED,
     "occupancy": replace(EXPORTED, survey=None, products={"grid": GRID}),
     "mesh": replace(EXPORTED, survey=None, products={"mesh": MADE.mesh}),
-    "mesh of a cloud": CloudSummary(cloud="c.ply", mesh=PairMeshFigures(1, 2, 3, 0.9), **COST),
+    "mesh of a cloud": CloudSummary(
+        cloud="c.ply", mesh=MeshFigures(faces=3, mesh_coverage=0.9), **COST
+    ),
     "export of a pair": CloudSummary(cloud="c.ply", run=OUT, **COST),
     "audit": AUDITED,
     "audit of what cannot be used": replace(

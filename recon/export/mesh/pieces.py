@@ -63,10 +63,13 @@ class MeshFigures(ProductFigures):
     faces: int = 0
     tiles: int | None = optional()  # pieces that it was made in
     mesh_offset_m: Sequence[float] | None = optional()  # to be added for survey coordinates
+    mesh_coverage: float | None = optional()  # fraction of the measured points on it, of a pair
 
     @property
     def text(self) -> str:
-        return f"{self.faces:,} faces"
+        covered = self.mesh_coverage
+        on = "" if covered is None else f", on it {100 * covered:.0f} % of the measured points"
+        return f"{self.faces:,} faces{on}"
 
 
 class MadeMesh(NamedTuple):
