@@ -70,7 +70,7 @@ from recon.rig.capture import CaptureFigures, CaptureSummary
 from recon.rig.rectification import ByCalibration, RectifySummary
 from recon.run.batch.results import JobFacts, JobSummary
 from recon.sources.source import Latency, LiveFigures, SourceFigures
-from tests.rig.calibrate.test_result import GOOD
+from tests.scenery.calibrated import GOOD
 
 MOST_LINES, COLUMNS = 8, 80
 OUT = "outputs/map/2026-11-29T12-00-00Z"

@@ -327,7 +327,7 @@ def recorded(folder: Path, left_s: list[float], right_s: list[float], frames: in
     cameras = FakeCamera("l", left_s), FakeCamera("/dev/video2", right_s)
     cameras[1].exposure = 7.0
     settings = capture.RecordingSettings(frames=frames)
-    return cameras, record(cameras, folder, settings, None, lambda: False)
+    return cameras, record(cameras, folder, settings, None, lambda: False).to_json()
 
 
 def test_two_videos_are_recorded_and_mapped_at_once(pairs, tmp_path):
