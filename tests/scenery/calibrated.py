@@ -3,7 +3,8 @@
 from recon.rig.calibrate.figures import CalibrationFigures, WorkingError
 
 GOOD = CalibrationFigures(
-    board="chess:9x6:25mm", width_px=640, height_px=480, stereo_rms_px=0.2, left_rms_px=0.2, right_rms_px=0.2,
+    board="chess:9x6:25mm", width_px=640, height_px=480,
+    stereo_rms_px=0.2, left_rms_px=0.2, right_rms_px=0.2,
     epipolar_px=0.1, epipolar_95_px=0.3, baseline_m=0.12, baseline_interval_m=[0.119, 0.121],
     baseline_squares=4.8, focal_px=500.0, focal_interval_px=[499.0, 501.0], focal_right_px=500.0,
     rotation_spread_deg=0.1, views=25, views_used=25, views_repeated=[], views_dropped=[],
