@@ -29,7 +29,7 @@ class TrajectoryEvaluation(RunSummary):
     def rows(self) -> Rows:
         found = self.metrics
         ends = dict.fromkeys((min(found.segment_lengths_m), max(found.segment_lengths_m)))
-        segments = f"segments of {' to '.join(f'{length_m:g}' for length_m in ends)} m"
+        segments = f"segments of {' to '.join(f'{length_m:.3g}' for length_m in ends)} m"
         turned = f"{found.r_rel_deg_per_100m:.2g}°/100 m"
         worst = f"median {metres(found.ate_median_m)}, at most {metres(found.ate_max_m)}"
         path = f"{counted(found.frames, 'pose')}, {metres(found.path_length_m)} of path"
@@ -40,7 +40,6 @@ class TrajectoryEvaluation(RunSummary):
             ("drift", f"{found.t_rel_percent:.3g} %, {turned} ({segments})"),
             ("ATE", f"{metres(found.ate_m)} (RMS), {worst}"),
             ("RPE", f"{metres(found.rpe_m)}, {found.rpe_deg:.2g}° from frame to frame"),
-            *self.cost_row(),
             ("next", again if self.out is None else self.open_report()),
         ]
 
@@ -91,7 +90,6 @@ class MapEvaluation(RunSummary):
             ("distance", near),
             *shown,
             *([] if self.out is None else [("clouds", "error.ply, missed.ply, coloured by error")]),
-            *self.cost_row(),
             ("next", again if self.out is None else f"meshlab {shown_path(self.out, 'error.ply')}"),
         ]
 

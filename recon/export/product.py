@@ -57,7 +57,7 @@ class ProductFigures(Figures):
     def text(self) -> str:
         """The most important ones in a few words: what is counted, by the last word of its name."""
         counts = ((one.name, getattr(self, one.name)) for one in fields(self))
-        known = ((name.rpartition("_")[2], n) for name, n in counts if isinstance(n, int))
+        known = [(name.rpartition("_")[2], n) for name, n in counts if isinstance(n, int) and n]
         return ", ".join(f"{n:,} {word}" for word, n in known)
 
 
