@@ -10,7 +10,7 @@ import typer
 from recon.cli import options as opt
 from recon.cli.errors import one_line_errors
 from recon.cli.options import Commands
-from recon.cli.tables import print_remarks, print_rows, print_summary
+from recon.cli.tables import print_json, print_remarks, print_rows, print_summary
 
 app = Commands(name="evaluate", no_args_is_help=True, help="Compare results with ground truth.")
 
@@ -89,10 +89,10 @@ def middlebury(
         )
         form = Table.latex if latex else Table.text
         tables = join(map(form, middlebury_tables(summary.to_json())))
-    if shared.json:
-        shared.show(summary)
-        return
     print_remarks(summary.remarks(), verbose=shared.verbose)
+    if shared.json:
+        print_json(summary.to_json())
+        return
     if latex or shared.verbose:
         typer.echo(tables)
     if latex:
