@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, PointFigures
 from recon.io.models.npz import write_npz
 from recon.io.models.pcd import write_pcd
 from recon.io.models.ply import write_ply_tiles
@@ -23,6 +24,13 @@ _GROWTH: Final = 1.25
 _MUCH: Final = 0.02  # fraction of the points left out without a word; a busy street has less
 
 
+@dataclass(frozen=True)
+class CloudFigures(PointFigures):
+    """The fused cloud, without what moved."""
+
+    points_removed: int
+
+
 def cloud_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the fused cloud, and ``removed.ply`` beside it with what moved."""
     return export_cloud(context.placed.tiles, path, path.with_name("removed.ply"))
@@ -31,7 +39,7 @@ def cloud_product(context: ExportContext, path: Path) -> ExportResult:
 def pcd_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the fused cloud for PCL."""
     clouds = (tile.cloud for tile in context.placed.tiles)
-    return ExportResult({"points": write_pcd(path, clouds)})
+    return ExportResult(PointFigures(write_pcd(path, clouds)))
 
 
 def arrays_product(context: ExportContext, path: Path) -> ExportResult:
@@ -53,7 +61,7 @@ def arrays_product(context: ExportContext, path: Path) -> ExportResult:
         (tile.cloud.arrays for tile in context.placed.tiles if len(tile.cloud)),
         {name: np.concatenate(each) for name, each in whole.items()},
     )
-    return ExportResult({"points": points})
+    return ExportResult(PointFigures(points))
 
 
 def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> ExportResult:
@@ -67,8 +75,9 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Expor
     if removed is not None and tiles.config.fusion.remove_moving:
         moved = (tile.removed for tile in tiles)
         left_out = write_ply_tiles(removed, moved, frame="map")
-    figures = {"points": points, "points_removed": left_out}
-    return ExportResult(figures, _doubts(tiles, points, left_out), sample.cloud())
+    return ExportResult(
+        CloudFigures(points, left_out), _doubts(tiles, points, left_out), sample.cloud()
+    )
 
 
 def even_sample(tiles: Tiles) -> PointCloud:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from recon.core.errors import MappingError
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Int32
 from recon.export.occupancy import Flattening
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.io.models.nav2 import write_nav2_costs
 from recon.map.ground.surface import GroundSurface
 from recon.map.ground.traverse import (
@@ -25,13 +26,26 @@ from recon.map.map import Map
 from recon.map.sessions.placed import PlacedMap
 
 
+@dataclass(frozen=True)
+class CostmapFigures(ProductFigures):
+    """How many cells of a costmap are of each kind."""
+
+    costmap_free_cells: int
+    costmap_lethal_cells: int
+    costmap_unseen_cells: int
+    costmap_uncertain_cells: int
+
+    @property
+    def text(self) -> str:
+        return f"{self.costmap_free_cells:,} cells free, {self.costmap_lethal_cells:,} lethal"
+
+
 def costmap_product(context: ExportContext, path: Path) -> ExportResult:
     """Write costs in Nav2's mode ``scale``, given the path of their YAML file."""
     grid, warnings = make_costmap(context.map, context.placed)
     write_nav2_costs(path.with_suffix(""), grid)
-    named = {"free": FREE, "lethal": OCCUPIED, "unseen": UNKNOWN, "uncertain": UNSURE}
-    figures = {f"costmap_{name}_cells": int((grid.cells == v).sum()) for name, v in named.items()}
-    return ExportResult(figures, warnings, grid)
+    counts = (int((grid.cells == value).sum()) for value in (FREE, OCCUPIED, UNKNOWN, UNSURE))
+    return ExportResult(CostmapFigures(*counts), warnings, grid)
 
 
 def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str, ...]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +13,21 @@ from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64
 from recon.export.costmap import make_costmap
 from recon.export.occupancy import grounds, make_grid
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.export.rasters import ground_slopes
 from recon.io.models.ros_bag import Message, header, pose, write_bag
 from recon.map.ground.surface import GroundSurface
+
+
+@dataclass(frozen=True)
+class GridMapFigures(ProductFigures):
+    """A grid map."""
+
+    gridmap_layers: Sequence[str]
+
+    @property
+    def text(self) -> str:
+        return ", ".join(self.gridmap_layers)
 
 
 def gridmap_product(context: ExportContext, folder: Path) -> ExportResult:
@@ -46,7 +59,7 @@ def gridmap_product(context: ExportContext, folder: Path) -> ExportResult:
     time_ns = round(1e9 * float(context.map.first.trajectory.timestamps_s[0]))
     with write_bag(folder) as bag:
         bag.write("/grid_map", time_ns, _message(time_ns, flat, layers), kept=True)
-    return ExportResult({"gridmap_layers": [*layers]}, warnings)
+    return ExportResult(GridMapFigures([*layers]), warnings)
 
 
 def _known(grid: OccupancyGrid) -> Float64:

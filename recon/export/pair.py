@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from recon.core.values.cloud import Frame
 from recon.core.values.image import in_colour
 from recon.export.mesh.coverage import check_coverage, mesh_coverage
 from recon.export.mesh.grid import mesh_grid
-from recon.export.mesh.pieces import WHOLE
+from recon.export.mesh.pieces import WHOLE, MeshFigures
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.io.images.disparity import fitting_scale, write_disparity_png, write_pfm
 from recon.io.images.image import read_image, write_image
@@ -132,7 +132,7 @@ def write_surface(
 
 def mesh_cloud(
     cloud: PointCloud, camera: RectifiedCamera | None, settings: MeshSettings, run: Path
-) -> tuple[TriangleMesh, dict[str, Any]]:
+) -> tuple[TriangleMesh, MeshFigures]:
     """Mesh a cloud in one piece, as its camera saw it if it is that of a pair; with figures.
 
     ``run`` is the folder of the pair, in which its left image may be.
@@ -141,13 +141,16 @@ def mesh_cloud(
         what, hint = "only the surface of a pair is closed behind", "name the folder of its run"
         raise MeshingError(what, got=f"mesh.pair_solid_m={settings.pair_solid_m:g}", hint=hint)
     if camera is None:
-        mesh, covered = reconstruct_mesh(cloud, settings), {}
+        mesh, coverage = reconstruct_mesh(cloud, settings), None
     else:
         mesh = _surface(cloud, camera, settings, _photo_of(run, camera))
-        covered = {"mesh_coverage": _coverage(mesh, cloud, settings)}
-    sizes = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    warnings = [line for ratio in covered.values() for line in check_coverage(ratio)]
-    return mesh, {**sizes, **covered, "warnings": warnings}
+        coverage = _coverage(mesh, cloud, settings)
+    return mesh, MeshFigures(
+        points=len(cloud),
+        vertices=len(mesh.vertices),
+        faces=len(mesh.faces),
+        mesh_coverage=coverage,
+    )
 
 
 def _photo_of(folder: Path, camera: RectifiedCamera) -> UInt8 | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from recon.core.errors import OutputError
+from recon.core.summary import Figures
 from recon.core.values.arrays import Float64
 from recon.export.images import DriveImages, open_images
 from recon.export.mesh.poisson import MeshSettings
@@ -48,11 +49,30 @@ class ExportContext:
         return None if self.survey is None else self.survey.system
 
 
+@dataclass(frozen=True)
+class ProductFigures(Figures):
+    """Base of what is counted and measured of a product."""
+
+    @property
+    def text(self) -> str:
+        """The most important ones in a few words: what is counted, by the last word of its name."""
+        counts = ((one.name, getattr(self, one.name)) for one in fields(self))
+        known = [(name.rpartition("_")[2], n) for name, n in counts if isinstance(n, int) and n]
+        return ", ".join(f"{n:,} {word}" for word, n in known)
+
+
+@dataclass(frozen=True)
+class PointFigures(ProductFigures):
+    """A cloud."""
+
+    points: int
+
+
 @dataclass(frozen=True, eq=False)
 class ExportResult:
-    """What is left of a written product: figures of the summary, warnings, what a report shows."""
+    """What is left of a written product: its figures, warnings, what a report shows."""
 
-    figures: dict[str, Any]
+    figures: ProductFigures
     warnings: Sequence[str] = ()
     value: Any = field(default=None, repr=False)
 

@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool
 from recon.export.occupancy import GROUND_RATIO, grounds
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, PointFigures
 from recon.io.models.copc import write_copc
 from recon.io.models.e57 import write_e57
 from recon.io.models.las import AreGround, write_las
@@ -27,7 +27,7 @@ def las_product(
     # A hundredth of a voxel, as a decimal: a millimetre on a road.
     step_m = 10.0 ** math.floor(math.log10(context.placed.tiles.config.fusion.voxel_m) - 2.0)
     how = {"step_m": step_m, "ground": _ground_of(context.placed)}
-    return ExportResult({"points": write(path, clouds, context.T_survey_map, context.crs, **how)})
+    return ExportResult(PointFigures(write(path, clouds, context.T_survey_map, context.crs, **how)))
 
 
 def copc_product(context: ExportContext, path: Path) -> ExportResult:
@@ -38,7 +38,7 @@ def copc_product(context: ExportContext, path: Path) -> ExportResult:
 def e57_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the cloud as E57, perhaps where a survey says."""
     clouds = (tile.cloud for tile in context.placed.tiles)
-    return ExportResult({"points": write_e57(path, clouds, context.T_survey_map, context.crs)})
+    return ExportResult(PointFigures(write_e57(path, clouds, context.T_survey_map, context.crs)))
 
 
 def _ground_of(placed: PlacedMap) -> AreGround:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -14,6 +15,7 @@ from recon.core.errors import MeshingError
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.machine import available_cores
 from recon.core.progress import tracked
+from recon.core.summary import optional
 from recon.core.text import counted
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Int32, Int64
@@ -33,7 +35,7 @@ from recon.export.mesh.cut import (
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings, reconstruct_mesh
 from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.voxels import reconstruct_map_surface
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh
 from recon.io.models.mlp import write_mlp
 from recon.map.cut import Rectangle
@@ -50,6 +52,31 @@ _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))  # of a piece: axis, 1 for the 
 _SEAM_M: Final = 0.15  # widest gap that is closed where two pieces meet
 _BULGE_M: Final = 2.0  # how far a surface may go beyond the points that it is made of
 PieceKey = tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshFigures(ProductFigures):
+    """The surface of a map; without points there is none."""
+
+    points: int | None = optional()  # of the cloud that it is made of
+    vertices: int | None = optional()
+    faces: int = 0
+    tiles: int | None = optional()  # pieces that it was made in
+    mesh_offset_m: Sequence[float] | None = optional()  # to be added for survey coordinates
+    mesh_coverage: float | None = optional()  # fraction of the measured points on it, of a pair
+
+    @property
+    def text(self) -> str:
+        covered = self.mesh_coverage
+        on = "" if covered is None else f", on it {100 * covered:.0f} % of the measured points"
+        return f"{self.faces:,} faces{on}"
+
+
+class MadeMesh(NamedTuple):
+    """What is left of a surface that was written."""
+
+    figures: MeshFigures
+    warnings: Sequence[str]
 
 
 class MeshPiece(NamedTuple):
@@ -86,11 +113,12 @@ def mesh_product(context: ExportContext, path: Path) -> ExportResult:
     warnings = [*made.warnings]
     if context.mesh.free_space and not has_occupancy(context.map):
         warnings.append("the map kept no rays: which faces lie in free space is not known")
-    small = made.figures["faces"] <= SAMPLE_FACES
+    small = made.figures.faces <= SAMPLE_FACES
     mesh = read_mesh(path) if small or context.survey is not None else None
     survey = path.with_name("survey")
-    there = {} if mesh is None else write_surveyed(context, mesh, survey, context.formats)
-    return ExportResult({**made.figures, **there}, warnings, mesh if small else None)
+    offset_m = None if mesh is None else write_surveyed(context, mesh, survey, context.formats)
+    figures = replace(made.figures, mesh_offset_m=offset_m)
+    return ExportResult(figures, warnings, mesh if small else None)
 
 
 def export_mesh(
@@ -99,7 +127,7 @@ def export_mesh(
     path: Path,
     cloud: Path,
     threads: int | None = None,
-) -> ExportResult:
+) -> MadeMesh:
     """Write the surface of a map, its pieces if there are several, and a MeshLab project.
 
     Args:
@@ -123,8 +151,8 @@ def export_mesh(
         layers = {"mesh": path}
     write_mlp(path.with_suffix(".mlp"), {**layers, "cloud": cloud}, "map")
     vertices, faces = (sum(numbers) for numbers in [*zip(*pieces, strict=True)][1:])
-    figures = {"points": points.total(), "vertices": vertices, "faces": faces}
-    return ExportResult({**figures, "tiles": len(pieces)}, warnings)
+    figures = MeshFigures(points=points.total(), vertices=vertices, faces=faces, tiles=len(pieces))
+    return MadeMesh(figures, warnings)
 
 
 def _count(tiles: Tiles, settings: MeshSettings) -> Counter[PieceKey]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -24,15 +24,15 @@ _ROUND_M: Final = 100.0
 
 def write_surveyed(
     context: ExportContext, mesh: TriangleMesh, folder: Path, formats: Sequence[str]
-) -> dict[str, Any]:
-    """Write a mesh, map axes, once more into a folder; return its figures.
+) -> Sequence[float] | None:
+    """Write a mesh, map axes, once more into a folder; return what is to be added, metres.
 
     Its axes are east, north and up. ``offset.xyz`` has what is to be added to its coordinates:
     hundreds of metres to the east and north; ``mesh.prj`` the coordinate system, if it is known.
     Without a survey nothing is written.
     """
     if context.survey is None:
-        return {}
+        return None
     T_survey_map = context.T_survey_map
     offset_m = np.array([*(np.floor(T_survey_map[:2, 3] / _ROUND_M) * _ROUND_M), 0.0])
     T_mesh_map = T_survey_map.copy()
@@ -50,4 +50,4 @@ def write_surveyed(
     if context.crs is not None:
         wkt = check_crs(context.crs).to_wkt("WKT1_ESRI")
         write_text(folder / "mesh.prj", f"{wkt}\n")
-    return {"mesh_offset_m": offset_m.tolist()}
+    return list(offset_m.tolist())

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from recon.core.errors import MeshingError
+from recon.core.summary import optional
 from recon.core.text import counted
 from recon.core.values import Texture, TriangleMesh
 from recon.core.values.image import in_colour
@@ -18,7 +19,7 @@ from recon.export.mesh.charts import make_atlas
 from recon.export.mesh.pieces import SAMPLE_FACES, WHOLE, mesh_product
 from recon.export.mesh.surveyed import write_surveyed
 from recon.export.mesh.views import BestViews, PosedImage, paint
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.io.images.image import write_image
 from recon.io.models.mesh import read_mesh, write_mesh
 from recon.io.models.mlp import Photo, write_mlp
@@ -28,6 +29,20 @@ from recon.map.sessions.placed import settings_of
 _WITH_TEXTURE: Final = ("glb", "obj", "ply")
 Views = Callable[[], Iterable[PosedImage]]
 """Gives the same images again each time it is called, one in memory at a time."""
+
+
+@dataclass(frozen=True)
+class TextureFigures(ProductFigures):
+    """The picture on a surface."""
+
+    texture_px: int  # its larger side
+    texel_m: float
+    textured: float  # fraction of the faces that an image sees
+    mesh_offset_m: Sequence[float] | None = optional()  # to be added for survey coordinates
+
+    @property
+    def text(self) -> str:
+        return f"{self.texture_px} px, {100 * self.textured:.0f} % of the faces seen"
 
 
 def texture_product(context: ExportContext, path: Path) -> ExportResult:
@@ -53,13 +68,14 @@ def texture_product(context: ExportContext, path: Path) -> ExportResult:
         write_mesh(path.with_suffix(f".{suffix}"), textured, "map")
     photos = [*_photos(path.with_name("images"), drives)]
     write_mlp(path.with_suffix(".mlp"), {"mesh": whole}, "map", photos)
-    there = write_surveyed(context, textured, path.with_name("survey"), named)
-    return ExportResult({**figures, **there}, () if made is None else made.warnings)
+    offset_m = write_surveyed(context, textured, path.with_name("survey"), named)
+    figures = replace(figures, mesh_offset_m=offset_m)
+    return ExportResult(figures, () if made is None else made.warnings)
 
 
 def textured_mesh(
     mesh: TriangleMesh, views: Views, edge_m: float, range_m: float, most_px: int
-) -> tuple[TriangleMesh, dict[str, float]]:
+) -> tuple[TriangleMesh, TextureFigures]:
     """Return a mesh in charts whose picture is painted by images; and figures of it.
 
     Args:
@@ -84,12 +100,8 @@ def textured_mesh(
     uv = (atlas.places / [atlas.width_px, atlas.height_px]).astype(np.float32)
     # Colours of vertices would darken the picture in some viewers.
     textured = replace(atlas.mesh, rgb=None, texture=Texture(picture, uv))
-    figures = {
-        "texture_px": max(atlas.width_px, atlas.height_px),
-        "texel_m": atlas.texel_m,
-        "textured": float(seen.mean()),
-    }
-    return textured, figures
+    size_px = max(atlas.width_px, atlas.height_px)
+    return textured, TextureFigures(size_px, atlas.texel_m, float(seen.mean()))
 
 
 def posed_images(drives: Sequence[DriveImages]) -> Iterator[PosedImage]:

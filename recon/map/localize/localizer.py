@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -304,5 +304,5 @@ class FirstFix:
         lasts = {loop.last: at for at, loops in self._seen for loop in loops}
         breaks = self._seen[-1][0][2]
         alone = breaks > 0 and sum(at[2] == breaks for at, _ in self._seen) == 1
-        how: Any = {"keyframes": 1 if alone else self._frames, "scale": self._known.scale}
-        return agreeing_loops(loops, firsts, lasts, **how)
+        keyframes = 1 if alone else self._frames
+        return agreeing_loops(loops, firsts, lasts, keyframes=keyframes, scale=self._known.scale)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from recon.core.errors import RegistrationError
+from recon.core.summary import Figures
 from recon.core.text import counted
 from recon.core.values.arrays import Float64, Int64
 from recon.odometry.health import name_frames
@@ -26,6 +28,16 @@ class Model:
     reprojection_px: float  # mean error of all features
 
 
+@dataclass(frozen=True)
+class SfmFigures(Figures):
+    """How many pairs structure from motion placed, and how well."""
+
+    pairs: int
+    registered: int  # in the largest model
+    models: Sequence[int]  # pairs in each
+    reprojection_px: float  # mean error in the largest
+
+
 @dataclass(frozen=True, eq=False)
 class FoundPoses:
     """What structure from motion found of the pairs of a source."""
@@ -33,13 +45,9 @@ class FoundPoses:
     pairs: int  # number of pairs of the source
     models: tuple[Model, ...]  # the largest first; no pair is in two of them
 
-    def figures(self) -> dict[str, Any]:
-        return {
-            "pairs": self.pairs,
-            "registered": len(self.models[0].frames),
-            "models": [len(model.frames) for model in self.models],
-            "reprojection_px": self.models[0].reprojection_px,
-        }
+    def figures(self) -> SfmFigures:
+        sizes = [len(model.frames) for model in self.models]
+        return SfmFigures(self.pairs, sizes[0], sizes, self.models[0].reprojection_px)
 
     def warnings(self) -> list[str]:
         """Return what the user should know, the most important first."""

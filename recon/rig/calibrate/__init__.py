@@ -4,6 +4,6 @@
   one image, and whether it has the stated size;
 - `stereo.py`: first guesses, and both cameras without the views that do not fit; `bundle.py`: the
   solver;
-- `bootstrap.py`: how sure the fit is; `result.py`: its figures and files; `verdict.py`: what it is
-  good for.
+- `bootstrap.py`: how sure the fit is; `figures.py`: how well it describes the views; `verdict.py`:
+  what it is good for; `result.py`: all of it, and its files.
 """

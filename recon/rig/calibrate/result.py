@@ -5,29 +5,76 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from recon.core.text import to_json
+from recon.core.summary import Rows, RunSummary, inline, optional, shown_path
+from recon.core.text import counted, metres
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bootstrap import Spread
 from recon.rig.calibrate.bundle import View
+from recon.rig.calibrate.figures import CalibrationFigures, DepthErrorCm, WorkingError
 from recon.rig.calibrate.stereo import StereoFit
-from recon.rig.calibrate.verdict import TILT_DEG
+from recon.rig.calibrate.verdict import (
+    TILT_DEG,
+    CalibrationFinding,
+    Verdict,
+    judge_calibration,
+    verdict_of_calibration,
+)
 from recon.rig.settings import CalibratedSettings
 from recon.rig.written import CalibrationForm, write_rig
+from recon.sources.image_names import ImagePairs
 from recon.stereo.rectify.rectifier import RectifyingTurns, plan_turns
 
 _CELLS: Final = (8, 6)  # image cells; without corners in one, the lens is extrapolated there
-_DEPTH_CM: Final = ("calibration", "low", "high", "matching")  # of each `DepthError`
 # Figures that are also written into the calibration file.
 _KEPT: Final = (
     "verdict", "board", "stereo_rms_px", "epipolar_px", "baseline_interval_m", "focal_interval_px",
     "views_used", "views_dropped", "depth_error_cm",
 )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationSummary(RunSummary):
+    """What `recon calibrate` found; its warnings are the texts of its findings."""
+
+    figures: CalibrationFigures = inline()
+    model: str  # of the lenses
+    verdict: Verdict
+    findings: Sequence[CalibrationFinding]
+    frames_left_out: int  # images without a partner
+    files: Sequence[str] | None = optional()  # where else the calibration was written
+
+    def remarks(self) -> list[tuple[str, str]]:
+        return [(finding.severity, finding.text) for finding in self.findings]
+
+    def rows(self) -> Rows:
+        found, out = self.figures, self.out or ""
+        low_m, high_m = found.baseline_interval_m
+        low_px, high_px = found.focal_interval_px
+        baseline = f"{found.baseline_m:.4g} m ({low_m:.4g} to {high_m:.4g})"
+        focal = f"{found.focal_px:.1f} px ({low_px:.1f} to {high_px:.1f})"
+        views = f"{found.views_used} of {counted(found.views, 'view')}"
+        working = found.working_error
+        ratio, at = working.calibration_ratio, metres(working.distance_m)
+        off = "no common view" if ratio is None else f"error of {100 * ratio:.1f} %"
+        file = (self.files or [str(Path(out, "calibration.yaml"))])[0]
+        again = "take other views as said above, and calibrate again"
+        use = f"recon audit DRIVE --calib {shown_path(file)}"
+        return [
+            (f"calibration of {views}, lens {self.model}: {self.verdict}",),
+            ("file", ", ".join(self.files or [file])),
+            ("report", str(Path(out, "report.html"))),
+            ("fit", f"{found.stereo_rms_px:.2f} px, epipolar error {found.epipolar_px:.2f} px"),
+            ("rig", f"baseline {baseline}, focal {focal}"),
+            ("depth", f"{off} at {at} expected of the calibration"),
+            *self.cost_row(),
+            ("next", again if self.verdict == "repeat" else use),
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,21 +87,33 @@ class CalibrationResult:
     spread: Spread
     turns: RectifyingTurns
     epipolar_error_px: Float64  # (N,), epipolar errors of all corners after rectification
-    summary: dict[str, Any]  # the figures of ``summary.json``
+    summary: CalibrationSummary
 
 
 def describe_calibration(
-    seen: BoardViews, fit: StereoFit, spread: Spread, config: CalibratedSettings
+    seen: BoardViews,
+    fit: StereoFit,
+    spread: Spread,
+    config: CalibratedSettings,
+    images: ImagePairs,
 ) -> CalibrationResult:
-    """Rectify the views with the calibrated rig, and measure how well it describes them."""
+    """Rectify the views with the calibrated rig, measure how well it describes them, and judge."""
     turns = plan_turns(fit.calibration, config.rectification)
     rows = []
     for left_px, right_px in map(shared_pixels, fit.views):
         left = turns.place(fit.calibration, left_px)
         rows.append(left[:, 1] - turns.place(fit.calibration, right_px, right=True)[:, 1])
     epipolar_error_px = np.concatenate(rows)
-    summary = _summarise(seen, fit, spread, epipolar_error_px)
-    summary["rectified_focal_px"] = turns.camera.focal_px
+    figures = _figures(seen, fit, spread, epipolar_error_px, turns.camera.focal_px)
+    findings = judge_calibration(seen.board, images, figures)
+    summary = CalibrationSummary(
+        figures=figures,
+        model=config.calibration.model,
+        verdict=verdict_of_calibration(findings),
+        findings=findings,
+        frames_left_out=len(images.lonely),
+        warnings=[finding.text for finding in findings],
+    )
     return CalibrationResult(config, seen, fit, spread, turns, epipolar_error_px, summary)
 
 
@@ -62,58 +121,72 @@ def write_calibration(
     path: Path, run: CalibrationResult, form: CalibrationForm | None = None
 ) -> tuple[Path, ...]:
     """Write the calibrated rig; see `write_rig`."""
-    quality = {key: run.summary[key] for key in _KEPT}
+    found = run.summary.to_json()
+    quality = {key: found[key] for key in _KEPT}
     return write_rig(path, run.fit.calibration, run.config.rectification, form, quality)
 
 
-def _summarise(
-    seen: BoardViews, fit: StereoFit, spread: Spread, epipolar_error_px: Float64
-) -> dict[str, Any]:
-    rig, away_m = fit.calibration, _distances_m(fit)
+def _figures(
+    seen: BoardViews,
+    fit: StereoFit,
+    spread: Spread,
+    epipolar_error_px: Float64,
+    rectified_focal_px: float,
+) -> CalibrationFigures:
+    rig, away_m, away = fit.calibration, _distances_m(fit), spread.working
     # Angles between the board's normal and the optical axis of the left camera.
     tilts_deg = np.degrees(np.arccos(np.clip(np.abs(fit.state.T_rig_board[:, 2, 2]), 0.0, 1.0)))
-    return {
-        "board": str(seen.board),
-        "model": rig.left.model,
-        "width_px": seen.size_px[0],
-        "height_px": seen.size_px[1],
-        "stereo_rms_px": fit.rms_px,
-        "left_rms_px": fit.alone_px[0],
-        "right_rms_px": fit.alone_px[1],
-        "epipolar_px": float(np.abs(epipolar_error_px).mean()),
-        "epipolar_95_px": float(np.quantile(np.abs(epipolar_error_px), 0.95)),
-        "baseline_m": rig.baseline_m,
-        "baseline_interval_m": list(spread.baseline_m),
-        "baseline_squares": rig.baseline_m / seen.board.square_m,
-        "focal_px": float(rig.left.matrix[0, 0]),
-        "focal_interval_px": list(spread.focal_px),
-        "focal_right_px": float(rig.right.matrix[0, 0]),
-        "rotation_spread_deg": spread.rotation_deg,
-        "views": seen.count,
-        "views_used": len(fit.views),
-        "views_repeated": list(fit.repeated),
-        "views_dropped": list(fit.dropped),
-        "dropped_error_px": fit.dropped,
-        "pictures_without_board": [path.name for path in seen.empty],
-        "view_errors_px": {
+    return CalibrationFigures(
+        board=str(seen.board),
+        width_px=seen.size_px[0],
+        height_px=seen.size_px[1],
+        stereo_rms_px=fit.rms_px,
+        left_rms_px=fit.alone_px[0],
+        right_rms_px=fit.alone_px[1],
+        epipolar_px=float(np.abs(epipolar_error_px).mean()),
+        epipolar_95_px=float(np.quantile(np.abs(epipolar_error_px), 0.95)),
+        baseline_m=rig.baseline_m,
+        baseline_interval_m=list(spread.baseline_m),
+        baseline_squares=rig.baseline_m / seen.board.square_m,
+        focal_px=float(rig.left.matrix[0, 0]),
+        focal_interval_px=list(spread.focal_px),
+        focal_right_px=float(rig.right.matrix[0, 0]),
+        rotation_spread_deg=spread.rotation_deg,
+        views=seen.count,
+        views_used=len(fit.views),
+        views_repeated=list(fit.repeated),
+        views_dropped=list(fit.dropped),
+        dropped_error_px=fit.dropped,
+        pictures_without_board=[path.name for path in seen.empty],
+        view_errors_px={
             view.name: [float(value) for value in errors]
             for view, errors in zip(fit.views, fit.errors_px, strict=True)
         },
-        "coverage_left": _coverage([view.seen[0].pixels for view in fit.views], rig.left),
-        "coverage_right": _coverage([view.seen[1].pixels for view in fit.views], rig.right),
-        "tilt_max_deg": float(tilts_deg.max()),
-        "tilted_ratio": float((tilts_deg >= TILT_DEG).mean()),
-        "far_to_near": float(away_m.max() / away_m.min()),
-        "depth_error_cm": {
-            f"{each.depth_m:g}": {k: to_json(100.0 * getattr(each, f"{k}_m")) for k in _DEPTH_CM}
+        coverage_left=_coverage([view.seen[0].pixels for view in fit.views], rig.left),
+        coverage_right=_coverage([view.seen[1].pixels for view in fit.views], rig.right),
+        tilt_max_deg=float(tilts_deg.max()),
+        tilted_ratio=float((tilts_deg >= TILT_DEG).mean()),
+        far_to_near=float(away_m.max() / away_m.min()),
+        depth_error_cm={
+            f"{each.depth_m:g}": DepthErrorCm(
+                _known(100.0 * each.calibration_m),
+                _known(100.0 * each.low_m),
+                _known(100.0 * each.high_m),
+                100.0 * each.matching_m,
+            )
             for each in spread.depths
         },
-        "working_error": {
-            "distance_m": spread.working.depth_m,
-            "calibration_ratio": to_json(spread.working.calibration_m / spread.working.depth_m),
-            "matching_ratio": spread.working.matching_m / spread.working.depth_m,
-        },
-    }
+        working_error=WorkingError(
+            away.depth_m,
+            _known(away.calibration_m / away.depth_m),
+            away.matching_m / away.depth_m,
+        ),
+        rectified_focal_px=rectified_focal_px,
+    )
+
+
+def _known(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def shared_pixels(view: View) -> tuple[Float64, Float64]:
@@ -138,23 +211,3 @@ def _distances_m(fit: StereoFit) -> Float64:
         for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
     ]
     return np.asarray(np.linalg.norm(middles, axis=1))
-
-
-def describe_depths(summary: dict[str, Any]) -> dict[str, str]:
-    """Return the depth errors of a summary as text, one line per distance."""
-    working = summary["working_error"]
-    ratio = working["calibration_ratio"]
-    text = "unknown" if ratio is None else f"{100 * ratio:.1f} %"
-    lines = {f"depth error at the working distance of {working['distance_m']:.3g} m": text}
-    for depth, cm in summary["depth_error_cm"].items():
-        known = "no common view"
-        if cm["calibration"] is not None:
-            known = f"{_short(cm['calibration'])} cm"
-            known += f", in the middle {_short(cm['low'])} to {_short(cm['high'])}"
-        lines[f"depth error at {depth} m"] = f"{known}; of matching {_short(cm['matching'])} cm"
-    return lines
-
-
-def _short(value: float) -> str:
-    """Return two significant digits, without an exponent."""
-    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"

@@ -8,6 +8,7 @@ from typing import Any, Final, Literal
 
 from recon.core.text import counted
 from recon.core.values.board import CalibrationBoard
+from recon.rig.calibrate.figures import CalibrationFigures
 from recon.sources.image_names import ImagePairs
 
 Verdict = Literal["good", "usable", "repeat"]
@@ -82,31 +83,32 @@ def verdict_of_calibration(findings: Sequence[CalibrationFinding]) -> Verdict:
 
 
 def judge_calibration(
-    board: CalibrationBoard, images: ImagePairs, summary: dict[str, Any]
+    board: CalibrationBoard, images: ImagePairs, figures: CalibrationFigures
 ) -> list[CalibrationFinding]:
     """Return all findings of a calibration, the gravest first."""
+    known = figures.to_json()
 
     def described(severity: Severity, found: Found) -> list[CalibrationFinding]:
         return [
-            CalibrationFinding(code, severity, _TEXTS[code].format_map(summary | own))
+            CalibrationFinding(code, severity, _TEXTS[code].format_map(known | own))
             for code, own in found
         ]
 
-    ratio = summary["working_error"]["calibration_ratio"]
+    ratio = figures.working_error.calibration_ratio
     found = described(
-        "fatal" if ratio is None or ratio > _USABLE else "warning", _depth_faults(board, summary)
+        "fatal" if ratio is None or ratio > _USABLE else "warning", _depth_faults(board, figures)
     )
-    found += described("warning", _doubts(board, summary))
+    found += described("warning", _doubts(board, figures))
     lacking: list[CalibrationFinding] = []
     if verdict_of_calibration(found) != "good":
         nothing = CalibrationFinding("more", "note", _NOTHING_LACKS)
-        lacking = described("note", _lacks(summary)) or [nothing]
-    return [*found, *described("note", _left_out(board, images, summary)), *lacking]
+        lacking = described("note", _lacks(figures)) or [nothing]
+    return [*found, *described("note", _left_out(board, images, figures)), *lacking]
 
 
-def _depth_faults(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
-    expected = summary["working_error"]
-    distance_m, ratio = expected["distance_m"], expected["calibration_ratio"]
+def _depth_faults(board: CalibrationBoard, found: CalibrationFigures) -> Found:
+    expected = found.working_error
+    distance_m, ratio = expected.distance_m, expected.calibration_ratio
     at = _length(distance_m, board)
     if ratio is None:
         yield "overlap", {"at": at}
@@ -115,23 +117,22 @@ def _depth_faults(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
         yield "depth", {"at": at, "wrong": wrong, "percent": 100 * ratio}
 
 
-def _doubts(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
-    if summary["views_used"] < _FEW_VIEWS:
-        yield "views", {"views": counted(summary["views_used"], "different view")}
-    for side in ("left", "right"):
-        ratio = summary[f"coverage_{side}"]
+def _doubts(board: CalibrationBoard, found: CalibrationFigures) -> Found:
+    if found.views_used < _FEW_VIEWS:
+        yield "views", {"views": counted(found.views_used, "different view")}
+    for side, ratio in (("left", found.coverage_left), ("right", found.coverage_right)):
         if ratio < _SMALL_COVERAGE:
             yield "coverage", {"percent": 100 * ratio, "side": side}
-    if summary["stereo_rms_px"] > _APART * max(summary["left_rms_px"], summary["right_rms_px"]):
+    if found.stereo_rms_px > _APART * max(found.left_rms_px, found.right_rms_px):
         yield "together", {}
-    if summary["epipolar_95_px"] > _ROWS_PX:
+    if found.epipolar_95_px > _ROWS_PX:
         yield "rows", {}
     shortest, longest = _USUAL_BASELINE_M
-    if board.metric and not shortest <= summary["baseline_m"] <= longest:
+    if board.metric and not shortest <= found.baseline_m <= longest:
         yield "baseline", {"square_mm": 1e3 * board.square_m}
 
 
-def _left_out(board: CalibrationBoard, images: ImagePairs, summary: dict[str, Any]) -> Found:
+def _left_out(board: CalibrationBoard, images: ImagePairs, found: CalibrationFigures) -> Found:
     """Yield what was left out or is not known; none of it makes the depth of this rig worse."""
     if not board.metric:
         yield "square", {}
@@ -140,28 +141,28 @@ def _left_out(board: CalibrationBoard, images: ImagePairs, summary: dict[str, An
     if images.lonely:
         names = _listed([path.name for path in images.lonely])
         yield "unpaired", {"count": len(images.lonely), "names": names}
-    if summary["pictures_without_board"]:
-        yield "board", {"names": _listed(summary["pictures_without_board"])}
-    if summary["views_dropped"]:
-        yield "dropped", {"names": _listed(summary["views_dropped"])}
-    if summary["views_repeated"]:
-        yield "repeats", {"views": counted(len(summary["views_repeated"]), "view")}
+    if found.pictures_without_board:
+        yield "board", {"names": _listed(found.pictures_without_board)}
+    if found.views_dropped:
+        yield "dropped", {"names": _listed(found.views_dropped)}
+    if found.views_repeated:
+        yield "repeats", {"views": counted(len(found.views_repeated), "view")}
 
 
-def _lacks(summary: dict[str, Any]) -> Found:
-    side, ratio = min((summary[f"coverage_{side}"], side) for side in ("left", "right"))[::-1]
+def _lacks(found: CalibrationFigures) -> Found:
+    ratio, side = min((found.coverage_left, "left"), (found.coverage_right, "right"))
     if _SMALL_COVERAGE <= ratio < _COVERED:
         yield "corners", {"percent": 100 * ratio, "side": side}
-    if summary["tilted_ratio"] < _TILTED:
-        yield "tilt", {"percent": 100 * summary["tilted_ratio"]}
-    low, high = summary["focal_interval_px"]
-    if high - low > 2 * _UNSURE_FOCAL * summary["focal_px"]:
+    if found.tilted_ratio < _TILTED:
+        yield "tilt", {"percent": 100 * found.tilted_ratio}
+    low, high = found.focal_interval_px
+    if high - low > 2 * _UNSURE_FOCAL * found.focal_px:
         yield "focal", {"low": low, "high": high}
-    if summary["far_to_near"] < _FAR_TO_NEAR:
+    if found.far_to_near < _FAR_TO_NEAR:
         yield "distances", {}
-    if summary["stereo_rms_px"] > _SHARP_PX:
+    if found.stereo_rms_px > _SHARP_PX:
         yield "sharpness", {}
-    if _FEW_VIEWS <= summary["views_used"] < _ENOUGH_VIEWS:
+    if _FEW_VIEWS <= found.views_used < _ENOUGH_VIEWS:
         yield "more", {}
 
 
@@ -171,5 +172,5 @@ def _length(metres: float, board: CalibrationBoard) -> str:
     return f"{100 * metres:.2g} cm" if metres < 0.995 else f"{metres:.3g} m"
 
 
-def _listed(names: list[str]) -> str:
+def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
