@@ -57,7 +57,7 @@ def measure(drive: Path, reference: Path, poses: Path, folder: Path) -> dict[str
     """Map a drive, and compare its surfaces."""
     run = folder / "run"
     options = MapOptions(out=run, mesh=False, audit=False)
-    summary = run_map(open_source(drive), load_config(None), options).summary
+    summary = run_map(open_source(drive), load_config(None), options).summary.to_json()
     mapping_s = summary["frames"] / summary["fps"]
     true, found = replace(read_ply(reference), frame="camera"), {}
     for way in ("voxels", "poisson"):

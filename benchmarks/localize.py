@@ -138,8 +138,8 @@ def figures_of(source: Any, map_: Map, config: ReconConfig, truth: Any) -> dict[
         "frames": len(drive.frames),
         "tracking": len(drive.tracked) / len(drive.frames),
         "coasting": (len(drive.placed) - len(drive.tracked)) / len(drive.frames),
-        "first_fix_frame": drive.figures()["first_fix_frame"],
-        "ms_per_frame": 1e3 * drive.figures()["seconds_per_frame"]["median"],
+        "first_fix_frame": drive.figures().first_fix_frame,
+        "ms_per_frame": 1e3 * drive.figures().seconds_per_frame.median,
     }
     if truth is None or not drive.placed:
         return figures

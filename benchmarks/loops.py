@@ -154,7 +154,7 @@ def closing(
         "path_m": round(source.trajectory.path_length_m, 2),
         "before": quality(before, source, surface),
         "after": quality(mapped, source, surface),
-        "loops": mapped.loops.figures(),
+        "loops": mapped.loops.figures().to_json(),
         "ms_per_frame": {name: round(1e3 * s / frames, 2) for name, s in seconds.items()},
     }
 

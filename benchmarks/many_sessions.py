@@ -25,6 +25,7 @@ import checkout  # noqa: F401 - what is measured
 import psutil
 
 from recon.commands.config import load_config
+from recon.core.summary import RunSummary
 from recon.export.make import make
 from recon.export.product import ExportContext
 from recon.map.map import Map
@@ -70,7 +71,7 @@ def build(folder: Path, sessions: int) -> Path:
         context = ExportContext(map_, place_map(map_, config), config.mesh)
         make(context, run.content, ("cloud", "octomap", "grid"))
         record = {"T_map_world": map_.first.T_map_world.tolist()}
-        run.finish({"warnings": []}, source="wall", inputs=(), record=record)
+        run.finish(RunSummary(), source="wall", inputs=(), record=record)
     return folder
 
 

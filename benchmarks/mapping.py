@@ -94,7 +94,7 @@ def budget(drive: Path, overrides: Sequence[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
         before_s = time.process_time()
-        summary = run_map(source, config, MapOptions(audit=False, out=out)).summary
+        summary = run_map(source, config, MapOptions(audit=False, out=out)).summary.to_json()
         stages = json.loads((out / "run.json").read_text())["timings"]
     frames, written_s = summary["frames"], stages["report"] + stages["hash"]
     return {

@@ -109,7 +109,7 @@ def halves(drive: Path, overlap: int, folder: Path) -> dict[str, Any]:
         run_map(source, config, replace(options, out=folder / name, audit=False))
     began = time.perf_counter()
     options = MapOptions("merge", folder / "merged", mesh=False)
-    summary = run_merge([folder / "first", folder / "second"], None, options)
+    summary = run_merge([folder / "first", folder / "second"], None, options).to_json()
     seconds = time.perf_counter() - began
     truth = MapOptions(source=drive).open(load_config())[0].truth
     found = compare_halves(folder, middle, None if truth is None else truth.trajectory)
@@ -173,9 +173,10 @@ def second(asked: argparse.Namespace, folder: Path) -> dict[str, Any]:
     runs = [folder / "day0", folder / "day1"]
     if asked.measured is not None:
         runs = [hold(*each, asked.measured) for each in zip(runs, days, strict=True)]
-    summary = run_merge(runs, None, MapOptions("merge", folder / "days", mesh=False))
+    merged = run_merge(runs, None, MapOptions("merge", folder / "days", mesh=False))
+    summary = merged.to_json()
     options = MapOptions("localize", folder / "found")
-    found = run_localize(days[1], folder / "day0", config, options).summary
+    found = run_localize(days[1], folder / "day0", config, options).summary.to_json()
     return {
         "links": summary["links"],
         "warnings": summary["warnings"],

@@ -23,7 +23,7 @@ from recon.commands.demo import demo_source
 from recon.commands.evaluate import run_evaluate_occupancy
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core.text import to_json
+from recon.core.summary import to_json
 
 ASKED: Final = {
     "voxels.precision": 0.9,

@@ -81,7 +81,7 @@ def measure(drive: Path, reference: Path, poses: Path, folder: Path) -> dict[str
             source = folder / "held"
             run_merge([run], options=MapOptions("merge", source, mesh=False), survey=survey)
         try:
-            told = run_export(source, products=("dsm",), out=out, survey=survey)
+            told = run_export(source, products=("dsm",), out=out, survey=survey).to_json()
         except ReconError as error:
             found[name] = {"said": error.what}
             continue

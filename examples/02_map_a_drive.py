@@ -21,8 +21,8 @@ def main(drive: str | None, folder: Path) -> None:
 
     run = recon.run_map(source, config, recon.MapOptions(out=folder))
 
-    print(f"{len(run.mapped.trajectory)} frames, {run.summary['path_length_m']:.1f} m")
-    print(f"{run.summary['points']} points, grid of {run.grid.cells.shape} cells")
+    print(f"{len(run.mapped.trajectory)} frames, {run.summary.path_length_m:.1f} m")
+    print(f"{run.summary.made.cloud.points} points, grid of {run.grid.cells.shape} cells")
     if run.metrics is not None:
         print(f"position error {run.metrics.ate_m:.3f} m (rms)")
     for warning in run.warnings:

@@ -68,8 +68,8 @@ def main(drive: str | None, folder: Path) -> None:
         chosen = config.with_odometry(odometry)
         options = recon.MapOptions(out=folder / getattr(odometry, "name", "visual"), mesh=False)
         summary = recon.run_map(source, chosen, options).summary
-        error = summary.get("trajectory", {}).get("ate_m", float("nan"))
-        print(f"{summary['odometry']}: {summary['path_length_m']:.1f} m, error {error:.3f} m")
+        error_m = float("nan") if summary.trajectory is None else summary.trajectory.ate_m
+        print(f"{summary.odometry}: {summary.path_length_m:.1f} m, error {error_m:.3f} m")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.errors import one_line_errors
-from recon.cli.tables import print_batch, print_json
+from recon.cli.tables import print_batch
 
 _HELP = "Job file (TOML, YAML), or a command and the sources to run it on."
 What = Annotated[list[str] | None, typer.Argument(metavar="JOBS|COMMAND SOURCE...", help=_HELP)]
@@ -101,6 +101,6 @@ def batch(
         stage("check the jobs")
         jobs = plan_jobs(listed)
         summary = run_batch(jobs, options, listed if resume is None else None)
-    print_json(summary) if json else print_batch(summary)
-    if summary["failed"]:
+    print_batch(summary, as_json=json, verbose=verbose)
+    if summary.failed:
         raise typer.Exit(1)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
 from recon.cli import options as opt
 from recon.cli.drive_options import SourceOptions, Start
 from recon.cli.errors import one_line_errors, until_interrupted
-from recon.cli.tables import print_figures, print_json, print_run
+from recon.cli.tables import print_summary
 from recon.core.errors import SettingsError
-from recon.core.text import is_count, visible
+from recon.core.text import is_count
 
 _BOARD = (
     "chess:9x6:25mm (inner corners, square size) or charuco:8x6:30mm:22mm:5x5_100 (squares, "
@@ -78,7 +79,6 @@ def calibrate(
         from recon.commands.config import load_config
         from recon.core.values.board import parse_board
         from recon.io.atomic import check_targets
-        from recon.rig.calibrate.verdict import describe_depths
         from recon.rig.written import form_of, targets_of
 
         if out is not None:
@@ -87,16 +87,17 @@ def calibrate(
         # kalibr's lens model has two radial terms.
         fitting = ["calibration.radial_terms=2"] if form == "kalibr" else []
         settings = load_config(shared.config, [*fitting, *shared.changes])
-        how: Any = {"file": out, "form": form, "out": report, "threads": shared.threads}
-        run = run_calibrate(left, right, parse_board(board), settings, **how)
-    if shared.json:
-        print_json(run.summary)
-    else:
-        figures = run.summary | describe_depths(run.summary) | {"warnings": ()}
-        print_run(figures, stages=shared.verbose)
-        for finding in run.summary["findings"]:
-            typer.echo(f"{finding['severity']}: {finding['text']}")
-        typer.echo(f"verdict: {run.summary['verdict']}")
+        run = run_calibrate(
+            left,
+            right,
+            parse_board(board),
+            settings,
+            file=out,
+            form=form,
+            out=report,
+            threads=shared.threads,
+        )
+    shared.show(run.summary)
 
 
 def board(
@@ -135,8 +136,8 @@ def board(
         from recon.core.values.board import parse_board
         from recon.rig.board_sheet import write_board
 
-        figures = write_board(out, parse_board(wanted), paper, dpi)
-    print_json(figures) if json else print_figures("", figures)
+        drawn = write_board(out, parse_board(wanted), paper, dpi)
+    print_summary(drawn, as_json=json)
 
 
 @opt.takes_groups
@@ -174,8 +175,15 @@ def rectify(
 
         settings = shared.settings()
         unit_m = unit_m or settings.source.metres_per_unit
-        how: Any = {"calibration": calib, "metres_per_unit": unit_m, "out": out}
-        run = run_rectify(left, right, settings, threads=shared.threads, **how)
+        run = run_rectify(
+            left,
+            right,
+            settings,
+            calibration=calib,
+            metres_per_unit=unit_m,
+            out=out,
+            threads=shared.threads,
+        )
     shared.show(run.summary)
 
 
@@ -219,7 +227,6 @@ def audit(
         from recon.cli.progress import announce
         from recon.commands.cameras import run_audit
         from recon.io.atomic import check_targets
-        from recon.report.audit_page import audit_lines
         from recon.rig.written import targets_of
         from recon.sources.registry import open_source
 
@@ -229,17 +236,11 @@ def audit(
         drive = open_source(source, reading.kind, settings.source)
         announce(drive, quiet=shared.quiet, verbose=verbose)
         found = run_audit(drive, settings, repair=repair, out=out)
-    if shared.json:
-        print_json(found.summary)
-        return
-    print_figures("", audit_lines(found.summary))
-    for line in found.summary["warnings"]:
-        typer.echo(visible(f"warning: {line}"))
-    for finding in found.findings:
-        typer.echo(visible(f"{'fatal' if finding.fatal else 'warning'}: {finding.text}"))
-    typer.echo(f"verdict: {found.verdict}")
-    if out is not None:
-        typer.echo(f"results: {out}")
+    summary = found.summary
+    summary = replace(summary, path=str(source))
+    if out is not None and not shared.json:
+        summary = replace(summary, out=str(out))
+    print_summary(summary, as_json=shared.json, verbose=verbose)
 
 
 def _size(text: str) -> dict[str, str]:
@@ -289,4 +290,4 @@ def capture(
         devices = [left] if right is None else [left, right]
         with until_interrupted() as stopped:
             summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)
-    print_json(summary) if shared.json else print_figures("", summary)
+    print_summary(summary, as_json=shared.json)

@@ -10,7 +10,7 @@ import typer
 from recon.cli import options as opt
 from recon.cli.errors import one_line_errors
 from recon.cli.options import Commands
-from recon.cli.tables import print_evaluation, print_figures, print_json
+from recon.cli.tables import print_json, print_remarks, print_rows, print_summary
 
 app = Commands(name="evaluate", no_args_is_help=True, help="Compare results with ground truth.")
 
@@ -88,14 +88,17 @@ def middlebury(
             auto_range=range_ == "auto",
         )
         form = Table.latex if latex else Table.text
-        tables = join(map(form, middlebury_tables(summary)))
-    for warning in summary["warnings"]:
-        typer.echo(f"warning: {warning}", err=True)
+        tables = join(map(form, middlebury_tables(summary.to_json())))
+    print_remarks(summary.remarks(), verbose=shared.verbose)
     if shared.json:
-        print_json(summary)
+        print_json(summary.to_json())
         return
-    typer.echo(tables)
-    typer.echo(f"results: {summary['out']}", err=latex)
+    if latex or shared.verbose:
+        typer.echo(tables)
+    if latex:
+        typer.echo(f"results: {summary.out}", err=True)
+    else:
+        print_rows(summary.rows())
 
 
 def _names(matcher: str | None) -> list[str] | None:
@@ -119,6 +122,7 @@ def disparity(
     ] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Compare a disparity map with ground truth: Middlebury's measures and KITTI's D1.
 
@@ -129,20 +133,11 @@ def disparity(
       recon evaluate disparity disparity.pfm disp0GT.pfm
       recon evaluate disparity disparity.pfm disp0GT.pfm --mask mask0nocc.png
     """
-    with one_line_errors(quiet=quiet):
+    with one_line_errors(quiet=quiet, verbose=verbose):
         from recon.commands.evaluate import run_evaluate_disparity
 
-        figures = run_evaluate_disparity(estimate, truth, mask, scale=scale, confidence=confidence)
-    if json:
-        print_json(figures)
-        return
-    shown = dict(figures)
-    for kind in ("sparse", "dense"):
-        flat = {f"bad {limit}": ratio for limit, ratio in figures[kind]["bad"].items()}
-        shown |= {f"{kind} {name}": value for name, value in (flat | figures[kind]).items()}
-    rated = figures.get("confidence", {})
-    shown |= {f"confidence {name}": rated[name] for name in ("ece", "ause") if name in rated}
-    print_figures(f"{estimate} against {truth}", shown)
+        found = run_evaluate_disparity(estimate, truth, mask, scale=scale, confidence=confidence)
+    print_summary(found, as_json=json, verbose=verbose)
 
 
 @app.command()
@@ -178,6 +173,7 @@ def trajectory(
     ] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Compare a trajectory with ground truth: KITTI's relative errors, ATE and RPE.
 
@@ -188,7 +184,7 @@ def trajectory(
       recon evaluate trajectory trajectory_kitti.txt poses.txt --out outputs/path
       recon evaluate trajectory trajectory_tum.txt groundtruth.txt --align sim3
     """
-    with one_line_errors(quiet=quiet):
+    with one_line_errors(quiet=quiet, verbose=verbose):
         from recon.commands.evaluate import run_evaluate_trajectory
         from recon.evaluation.trajectory import TrajectoryRules
 
@@ -199,10 +195,10 @@ def trajectory(
             "rpe_frames": rpe_frames,
         }
         rules = TrajectoryRules.parse(asked, where="recon evaluate trajectory")
-        figures = run_evaluate_trajectory(
+        found = run_evaluate_trajectory(
             estimate, truth, rules, times=times, tolerance_s=tolerance, out=out
         )
-    print_json(figures) if json else print_evaluation(f"{estimate} against {truth}", figures)
+    print_summary(found, as_json=json, verbose=verbose)
 
 
 @app.command()
@@ -216,6 +212,7 @@ def occupancy(
     ] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Compare voxels and grid of a demo run with the exact truth.
 
@@ -225,22 +222,11 @@ def occupancy(
     Examples:
       recon evaluate occupancy outputs/demo/latest --picture compared.png
     """
-    with one_line_errors(quiet=quiet):
+    with one_line_errors(quiet=quiet, verbose=verbose):
         from recon.commands.evaluate import run_evaluate_occupancy
-        from recon.core.text import to_json
 
         compared = run_evaluate_occupancy(run, least_frames, image=picture)
-        figures = {**to_json(compared.metrics), "warnings": compared.doubts}
-    if json:
-        print_json(figures)
-        return
-    shown = {
-        f"{part} {name}": value
-        for part, values in figures.items()
-        if isinstance(values, dict)
-        for name, value in values.items()
-    }
-    print_evaluation(f"{run} against the true street", {**shown, "warnings": compared.doubts})
+    print_summary(compared.summary, as_json=json, verbose=verbose)
 
 
 @app.command("map")
@@ -266,6 +252,7 @@ def map_(
     ] = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
+    verbose: opt.Verbose = False,
 ) -> None:
     """Compare a map with a reference cloud: precision, recall and F-score.
 
@@ -276,10 +263,10 @@ def map_(
       recon evaluate map outputs/map/latest lidar_map.ply --threshold 0.1,0.2,0.5
       recon evaluate map outputs/map/latest lidar_map.ply --align-to poses.txt
     """
-    with one_line_errors(quiet=quiet):
+    with one_line_errors(quiet=quiet, verbose=verbose):
         from recon.commands.evaluate import run_evaluate_map
 
-        figures = run_evaluate_map(
+        found = run_evaluate_map(
             run,
             reference,
             frame=reference_frame,
@@ -288,7 +275,7 @@ def map_(
             thresholds_m=opt.parse_numbers(threshold, "--threshold") or (),
             out=out,
         )
-    print_json(figures) if json else print_evaluation(f"{run} against {reference}", figures)
+    print_summary(found, as_json=json, verbose=verbose)
 
 
 @opt.takes_groups
@@ -319,8 +306,8 @@ def paper(
     """
     with shared.one_line_errors():
         from recon.commands.config import PAIR_DEFAULTS
-        from recon.commands.paper import headline, run_paper
+        from recon.commands.paper import run_paper
 
         settings = shared.settings(PAIR_DEFAULTS)
         summary = run_paper(scenes, settings, out=out, threads=shared.threads)
-    shared.show(summary if shared.json else {**headline(summary), **summary})
+    shared.show(summary)

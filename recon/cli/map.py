@@ -20,10 +20,11 @@ from recon.cli.drive_options import (
     read_start,
 )
 from recon.cli.errors import one_line_errors, until_interrupted
-from recon.cli.tables import print_json, print_run
-from recon.cli.view import View, view_beside
+from recon.cli.tables import print_summary
+from recon.cli.view import View
 
 if TYPE_CHECKING:
+    from recon.core.summary import RunSummary
     from recon.sources.source import StereoSource
 
 
@@ -123,12 +124,11 @@ def map_(
         from recon.commands.map import run_map
         from recon.commands.merge import run_map_into, run_remove
 
-        how: Any = {"begun": view_beside} if view else {}
         options = shared.options(
             out=out,
+            view=view,
             mesh=mesh,
             warn=partial(warn, quiet=shared.quiet, verbose=shared.verbose),
-            **how,
             workers=open_workers(workers, scheduler, shared),
             source=source,
             kind=reading.kind,
@@ -143,15 +143,15 @@ def map_(
         else:
             settings = shared.settings()
         if into is not None and remove is not None:
-            summary = run_remove(into, remove, settings, options)
+            shown: RunSummary = run_remove(into, remove, settings, options)
         else:
             drive, options = open_drive(options, settings, shared)
-            summary = (
+            shown = (
                 run_map(drive, settings, options).summary
                 if into is None
                 else run_map_into(into, drive, settings, options)
             )
-    shared.show(summary)
+    shared.show(shown)
 
 
 def piece(
@@ -180,7 +180,7 @@ def piece(
 
         options = MapOptions("piece", resume or out, threads, resume=resume is not None)
         summary = run_piece(plan, number, options)
-    print_json(summary) if json else print_run(summary, stages=verbose)
+    print_summary(summary, as_json=json, verbose=verbose)
 
 
 @opt.takes_groups
@@ -280,8 +280,9 @@ def live(
         stopped = stack.enter_context(until_interrupted())
         pose, _ = read_start(start)
         settings = shared.settings()
-        how: Any = {"begun": view_beside} if view else {}
-        options = shared.options("live", out, mesh=mesh, source=source, kind=reading.kind, **how)
+        options = shared.options(
+            "live", out, view=view, mesh=mesh, source=source, kind=reading.kind
+        )
         drive: StereoSource
         if right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]
@@ -326,8 +327,7 @@ def localize(
 
         pose, _ = read_start(start)
         settings = shared.settings()
-        how: Any = {"begun": view_beside} if view else {}
-        options = shared.options("localize", out, source=source, kind=reading.kind, **how)
+        options = shared.options("localize", out, view=view, source=source, kind=reading.kind)
         drive, options = open_drive(options, settings, shared)
         run = run_localize(drive, map_, settings, options, start=pose)
     shared.show(run.summary)

@@ -10,7 +10,7 @@ import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_origin, get_type_hints
@@ -19,13 +19,14 @@ import typer
 from typer.core import TyperCommand
 
 from recon.cli.errors import one_line_errors
-from recon.cli.tables import print_json, print_run
+from recon.cli.tables import print_summary
 from recon.core.errors import SettingsError
 from recon.core.text import parse_number, refuse_other_numbers
 
 if TYPE_CHECKING:
     from recon.commands.config import Changes, ReconConfig
     from recon.commands.map_options import MapOptions
+    from recon.core.summary import Summary
     from recon.map.sessions.measured import Survey
 
 _KEYWORD: Final = inspect.Parameter.KEYWORD_ONLY
@@ -72,7 +73,10 @@ Quiet = Annotated[
     bool, option("Show no progress: only results, warnings and errors.", "--quiet", "-q")
 ]
 Verbose = Annotated[
-    bool, option("Also print stage times; where there is no bar, JSON lines.", "--verbose", "-v")
+    bool,
+    option(
+        "Print all figures, too; progress as JSON lines where there is no bar.", "--verbose", "-v"
+    ),
 ]
 Formats = Annotated[
     list[str] | None,
@@ -178,14 +182,18 @@ class Shared(Asked):
     def one_line_errors(self) -> AbstractContextManager[None]:
         return one_line_errors(quiet=self.quiet, verbose=self.verbose)
 
-    def options(self, command: str = "map", out: Path | None = None, **more: Any) -> MapOptions:
-        """Return the options of a run that maps."""
+    def options(
+        self, command: str = "map", out: Path | None = None, *, view: bool = False, **more: Any
+    ) -> MapOptions:
+        """Return the options of a run that maps, which the browser may ``view`` meanwhile."""
+        from recon.cli.view import view_beside
         from recon.commands.map_options import MapOptions
 
-        return MapOptions(command, out, self.threads, **more)
+        options = MapOptions(command, out, self.threads, **more)
+        return replace(options, begun=view_beside) if view else options
 
-    def show(self, summary: Mapping[str, Any]) -> None:
-        print_json(summary) if self.json else print_run(summary, stages=self.verbose)
+    def show(self, summary: Summary) -> None:
+        print_summary(summary, as_json=self.json, verbose=self.verbose)
 
 
 def takes_groups(command: Callable[..., None]) -> Callable[..., None]:

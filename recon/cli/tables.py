@@ -1,10 +1,10 @@
-"""Prints results: a table for people, JSON for programs."""
+"""Prints results: a few lines or all figures for people, JSON for programs."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 import typer
@@ -13,12 +13,16 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from recon.core.text import counted, metres, visible, with_unit
+from recon.core.text import visible, with_unit
 
 if TYPE_CHECKING:
+    from recon.commands.batch import BatchSummary
     from recon.commands.config import SettingGroup
     from recon.commands.doctor import Check
+    from recon.core.summary import Rows, Summary
+    from recon.run.batch.results import JobSummary
 
+_NUMBER: Final = re.compile(r"\d[\d.,]*")
 _MOST_JOBS: Final = 200  # more lines of a batch than these nobody reads
 
 
@@ -27,94 +31,95 @@ def print_json(content: Mapping[str, Any]) -> None:
     typer.echo(json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False))
 
 
-def print_figures(title: str, figures: Mapping[str, Any]) -> None:
-    """Print a table of figures with their units; nested values appear only in ``--json``."""
+def print_summary(summary: Summary, *, as_json: bool = False, verbose: bool = False) -> None:
+    """Print what a command found, in a few lines, and warnings apart; ``verbose``: all figures."""
+    if as_json:
+        print_json(summary.to_json())
+        return
+    print_remarks(summary.remarks(), verbose=verbose)
+    if verbose:
+        print_figures(summary.to_json())
+    print_rows(summary.rows())
+
+
+def print_rows(rows: Rows) -> None:
+    """Print a sentence and aligned lines: what they are about, a file, figures."""
+    longest = [max((len(row[at]) for row in rows if len(row) > at + 1), default=0) for at in (0, 1)]
+    for row in rows:
+        cells = (text.ljust(longest[at]) for at, text in enumerate(row[:-1]))
+        typer.echo(visible("  ".join((*cells, row[-1]))))
+
+
+def print_remarks(remarks: Iterable[tuple[str, str]], *, verbose: bool = False) -> None:
+    """Print what the user should know on standard error, a line each.
+
+    Those that differ in numbers alone are counted, unless ``verbose``.
+    """
+    kinds: dict[str, list[str]] = {}
+    for number, (kind, text) in enumerate(remarks):
+        line = f"{kind}: {text}"
+        kinds.setdefault(str(number) if verbose else _NUMBER.sub("#", line), []).append(line)
+    for first, *others in kinds.values():
+        more = f" (and {len(others)} more like it)" if others else ""
+        typer.echo(visible(first + more), err=True)
+
+
+def print_figures(figures: Mapping[str, Any]) -> None:
+    """Print a table of all figures with their units, those of parts by dotted name."""
     table = Table(show_header=False)
-    for name, value in figures.items():
+    for name, value in _leaves(figures):
         if isinstance(value, str | bool):
             table.add_row(Text(visible(name)), Text(visible(str(value))))
-        elif isinstance(value, int | float):
+        else:
             text = f"{value:.4g}" if isinstance(value, float) else str(value)
             table.add_row(Text(visible(name)), with_unit(text, name))
-    if title:
-        typer.echo(visible(title))
     Console().print(table)
 
 
-def print_evaluation(title: str, figures: Mapping[str, Any]) -> None:
-    """Print the figures of a comparison and of each part, its warnings and its folder."""
-    shown = {key: value for key, value in figures.items() if key != "out"}
-    limits = figures.get("by_threshold", ())
-    if len(limits) > 1:
-        shown = {key: value for key, value in shown.items() if key not in limits[0]}
-    for part in (*figures.get("by_length", ()), *(limits if len(limits) > 1 else ())):
-        (_, name), *values = part.items()
-        shown |= {f"{key} at {name:g} m": value for key, value in values}
-    print_figures(title, shown)
-    for warning in figures["warnings"]:
-        typer.echo(visible(f"warning: {warning}"), err=True)
-    if "out" in figures:
-        typer.echo(f"results: {figures['out']}")
+def _leaves(figures: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield names and values; lists have parts alone, since others are rows of a matrix."""
+    for key, value in figures.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        elif isinstance(value, str | bool | int | float):
+            yield f"{prefix}{key}", value
+        elif isinstance(value, Sequence):
+            parts = {str(at): part for at, part in enumerate(value) if isinstance(part, Mapping)}
+            yield from _leaves(parts, f"{prefix}{key}.")
 
 
-def print_run(summary: Mapping[str, Any], *, stages: bool = False) -> None:
-    """Print a run's figures, its warnings and its folder."""
-    shown = {key: value for key, value in summary.items() if key != "out"}
-    for group in ("live", "prior", "loops", "links", "trajectory", "map", "disparity"):
-        shown |= {f"{group}.{key}": value for key, value in summary.get(group, {}).items()}
-    bad = summary.get("disparity", {}).get("bad", {})
-    shown |= {f"disparity.bad {float(limit):g}": ratio for limit, ratio in bad.items()}
-    latency_ms = summary.get("live", {}).get("latency_ms", {})
-    shown |= {f"live.latency_ms.{key}": value for key, value in latency_ms.items()}
-    for part in ("voxels", "grid"):
-        figures = summary.get("occupancy", {}).get(part, {})
-        shown |= {f"occupancy.{part}.{key}": value for key, value in figures.items()}
-    for drive in summary.get("sessions", ()):
-        place = "" if drive["linked"] else ", apart"
-        shown[f"session {drive['number']}"] = (
-            f"{drive['name']}: {counted(drive['frames'], 'frame')}{place}"
-        )
-    for name, point in summary.get("control", {}).items():
-        off = ", ".join(metres(point[key], "+") for key in ("east_m", "north_m", "up_m"))
-        kind = "check point" if point["check"] else "used" if point["used"] else "left out"
-        shown[f"control {name}"] = f"{off} ± {metres(point['sigma_m'])}, {kind}"
-    if stages:
-        shown |= {f"seconds.{key}": value for key, value in summary["stages"].items()}
-    print_figures("", shown)
-    for warning in summary["warnings"]:
-        typer.echo(visible(f"warning: {warning}"), err=True)
-    typer.echo(f"results: {summary['out']}")
-
-
-def print_batch(summary: Mapping[str, Any]) -> None:
-    """Print a line per job, what is wrong first; then remarks, and why jobs failed."""
+def print_batch(summary: BatchSummary, *, as_json: bool = False, verbose: bool = False) -> None:
+    """Print how a batch ended; ``verbose``: a line per job, what is wrong first."""
     from recon.run.batch.results import urgency
 
-    jobs = sorted(summary["jobs"], key=lambda job: urgency(job, job["figures"]))
-    Console().print(batch_table(jobs))
-    if (more := len(jobs) - _MOST_JOBS) > 0:
-        typer.echo(f"and {more} more, in table.csv")
-    for job in jobs:
-        if "remark" in job:
-            typer.echo(visible(f"remark: {job['name']}: {job['remark']}"))
-        if job["state"] == "failed":
-            typer.echo(visible(f"error: {job['name']}: {job['error']}"), err=True)
-    typer.echo(f"results: {summary['out']}")
+    jobs = sorted(summary.jobs, key=lambda job: urgency(job.facts, job.figures))
+    if not as_json:
+        failed = [job.facts for job in jobs if job.facts.error is not None]
+        print_remarks((("error", f"{job.name}: {job.error}") for job in failed), verbose=verbose)
+    if verbose and not as_json:
+        Console().print(batch_table(jobs))
+        if (more := len(jobs) - _MOST_JOBS) > 0:
+            typer.echo(f"and {more} more, in table.csv")
+        for job in jobs:
+            if job.facts.remark is not None:
+                typer.echo(visible(f"remark: {job.facts.name}: {job.facts.remark}"))
+    print_summary(summary, as_json=as_json)
 
 
-def batch_table(all_jobs: Sequence[Mapping[str, Any]]) -> Table:
+def batch_table(all_jobs: Sequence[JobSummary]) -> Table:
     """Return one line per job, with its size and the accuracy of its command."""
     from recon.run.batch.results import accuracies
 
     table, jobs = Table(show_edge=False, pad_edge=False), all_jobs[:_MOST_JOBS]
-    judged = accuracies(job["figures"] for job in jobs)
+    judged = accuracies(job.figures for job in jobs)
     for title in ("job", "state", "tries", "s", "MB", *judged):
         table.add_column(re.sub(r"(?<=[a-z])[._]", " ", title), overflow="fold")
     for job in jobs:
-        times = (str(job["tries"]), f"{job['seconds']:.1f}", f"{job['bytes'] / 1e6:.1f}")
-        figures = (job["figures"].get(name) for name in judged)
+        facts = job.facts
+        times = (str(facts.tries), f"{facts.seconds:.1f}", f"{facts.bytes / 1e6:.1f}")
+        figures = (job.figures.get(name) for name in judged)
         found = ("" if value is None else f"{value:.4g}" for value in figures)
-        table.add_row(*map(Text, (job["name"], job["state"], *times, *found)))
+        table.add_row(*map(Text, (facts.name, facts.state, *times, *found)))
     return table
 
 

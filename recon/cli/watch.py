@@ -32,7 +32,7 @@ def _refresh(rounds: Iterator[list[JobResult]]) -> None:
     stage("")  # the table says it
     with Live(console=Console(), auto_refresh=False) as live:
         for results in rounds:
-            rows = [{**one.facts, "figures": one.figures} for one in wrong_first(results)]
+            rows = [one.summary for one in wrong_first(results)]
             live.update(batch_table(rows), refresh=True)
 
 
@@ -41,7 +41,7 @@ def _list_changes(rounds: Iterator[list[JobResult]]) -> None:
     shown: dict[str, tuple[Any, ...]] = {}
     for results in rounds:
         for one in results:
-            now = one.facts["state"], one.last.tries
+            now = one.facts.state, one.last.tries
             if shown.get(one.job.name, ("not run", 0)) != now:
                 why = f": {one.last.error}" if one.failed else ""
                 typer.echo(f"{one.job.name}: {now[0]}, try {now[1]}, {one.seconds:.1f} s{why}")

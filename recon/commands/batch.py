@@ -4,23 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from recon.core.errors import ClusterError, OutputError
+from recon.core.summary import Rows, RunSummary, shown_path
+from recon.core.text import counted
 from recon.io.files import resolved
 from recon.report.batch_page import write_batch_page
 from recon.run.batch.cluster import BatchOptions
 from recon.run.batch.job import Job, is_done, last_outcome
 from recon.run.batch.job_file import PLAN, JobList
-from recon.run.batch.results import JobResult, compare, result_of, work_off
+from recon.run.batch.results import JobResult, JobSummary, compare, result_of, urgency, work_off
 from recon.run.directory import default_folder
 from recon.run.run import Run
 
 
 def run_batch(
     jobs: Sequence[Job], options: BatchOptions, listed: JobList | None = None
-) -> dict[str, Any]:
+) -> BatchSummary:
     """Run many commands, all checked: what `recon batch` does; returns the summary.
 
     Each job is a process of its own on its worker and writes a folder of its own, all or nothing;
@@ -47,25 +49,49 @@ def run_batch(
                             break
         results = compare([ended.get(job.name) or JobResult(job) for job in jobs])
         summary = _summary(results, len(ended) - len(done), run.watch.seconds["jobs"])
-        with run.report(summary):
-            write_batch_page(results, summary, run)
-        run.finish(summary, source=f"{len(jobs)} jobs", inputs=[folder / PLAN])
-    return summary
+        with run.report(summary) as summary:
+            write_batch_page(results, summary.to_json(), run)
+        return run.finish(summary, source=f"{len(jobs)} jobs", inputs=[folder / PLAN])
 
 
-def _summary(results: Sequence[JobResult], run_now: int, seconds: float) -> dict[str, Any]:
-    return {
-        "jobs": [
-            {**one.facts, "figures": dict(one.figures), "warnings": list(one.warnings)}
-            for one in results
-        ],
-        "succeeded": sum(one.ok for one in results),
-        "failed": sum(one.failed for one in results),
-        "not_run": sum(not one.ok and not one.failed for one in results),
-        "bytes": sum(one.bytes for one in results),
-        "jobs_per_hour": 3600.0 * run_now / seconds if run_now else None,
-        "warnings": [f"{one.job.name}: {text}" for one in results for text in one.warnings],
-    }
+@dataclass(frozen=True, kw_only=True)
+class BatchSummary(RunSummary):
+    """How the jobs of a batch ended; its warnings are those of the jobs."""
+
+    jobs: Sequence[JobSummary]
+    succeeded: int
+    failed: int
+    not_run: int
+    bytes: int
+    jobs_per_hour: float | None  # of those that were run now; None = none was
+
+    def rows(self) -> Rows:
+        left = f", {self.not_run} not run" if self.not_run else ""
+        ended = f"{self.succeeded} succeeded, {self.failed} failed{left}"
+        rate = () if self.jobs_per_hour is None else (f"{self.jobs_per_hour:.0f} jobs in an hour",)
+        first = min(self.jobs, key=lambda one: urgency(one.facts, one.figures), default=None)
+        rows: Rows = [
+            (f"{counted(len(self.jobs), 'job')}: {ended}",),
+            *self.folder_row(),
+            ("tables", "table.csv, table.md, table.tex", f"{self.bytes / 1e9:.3g} GB in all"),
+        ]
+        if first is not None and first.facts.remark is not None:
+            rows.append(("look at", first.facts.name, first.facts.remark))
+        resume = f"recon batch --resume {shown_path(self.out or '')}"
+        done = not (self.failed or self.not_run)
+        return [*rows, *self.cost_row(*rate), ("next", self.open_report() if done else resume)]
+
+
+def _summary(results: Sequence[JobResult], run_now: int, seconds: float) -> BatchSummary:
+    return BatchSummary(
+        jobs=[one.summary for one in results],
+        succeeded=sum(one.ok for one in results),
+        failed=sum(one.failed for one in results),
+        not_run=sum(not one.ok and not one.failed for one in results),
+        bytes=sum(one.bytes for one in results),
+        jobs_per_hour=3600.0 * run_now / seconds if run_now else None,
+        warnings=[f"{one.job.name}: {text}" for one in results for text in one.warnings],
+    )
 
 
 @contextmanager

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from recon.commands.config import ReconConfig
 from recon.core.errors import FormatError, OutputError, SourceError
@@ -26,12 +26,11 @@ from recon.rig.calibrate.stereo import calibrate_stereo, measure_spread
 from recon.rig.calibrate.verdict import (
     CalibrationResult,
     describe_calibration,
-    judge_calibration,
-    verdict_of_calibration,
     write_calibration,
 )
 from recon.rig.capture import (
     CaptureFolder,
+    CaptureSummary,
     RecordingSettings,
     capture_pairs,
     open_cameras,
@@ -93,24 +92,18 @@ def run_calibrate(
             fit = calibrate_stereo(seen.views, seen.size_px, config.calibration)
         with run.stage("bootstrap"), serial_algebra():
             spread = measure_spread(fit, config.calibration)
-        result = describe_calibration(seen, fit, spread, config)
-        summary = result.summary
-        summary["model"] = config.calibration.model
-        findings = judge_calibration(seen.board, images, summary)
-        summary["verdict"] = verdict_of_calibration(findings)
-        summary["findings"] = [asdict(finding) for finding in findings]
-        summary["frames_left_out"] = len(images.lonely)
-        summary["warnings"] = [finding.text for finding in findings]
+        result = describe_calibration(seen, fit, spread, config, images)
         write_calibration(run.path("calibration.yaml"), result, "recon")
+        summary = result.summary
         if file is not None:
-            summary["files"] = [str(path) for path in targets_of(file, form)]
-        with run.report(summary):
-            write_calibration_page(result, run)
+            summary = replace(summary, files=[str(path) for path in targets_of(file, form)])
+        with run.report(summary) as summary:
+            write_calibration_page(replace(result, summary=summary), run)
         source, record = " ".join(filter(None, (left, right))), {"board": str(seen.board)}
-        run.finish(summary, source=source, inputs=inputs, record=record)
+        summary = run.finish(summary, source=source, inputs=inputs, record=record)
         if file is not None:  # last: an interrupted run leaves nothing
             write_calibration(file, result, form)
-    return result
+    return replace(result, summary=summary)
 
 
 def _videos(left: str, right: str | None) -> list[Path]:
@@ -125,7 +118,6 @@ def _videos(left: str, right: str | None) -> list[Path]:
     return videos
 
 
-_WARN_EPIPOLAR_PX: Final = 0.5
 _KEPT_TYPES: Final = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff"})
 
 
@@ -153,8 +145,9 @@ def run_rectify(
             if calibration is None:
                 plan = plan_by_features(images)
             else:
-                how: Any = {"metres_per_unit": metres_per_unit}
-                plan = plan_by_calibration(calibration, images, config.rectification, **how)
+                plan = plan_by_calibration(
+                    calibration, images, config.rectification, metres_per_unit=metres_per_unit
+                )
         with run.stage("rectify"):
             pairs = tracked(read_pairs(images), "pairs", total=len(images.pairs))
             for pair, (left_file, right_file) in pairs:
@@ -163,40 +156,18 @@ def run_rectify(
                 write_image(run.path(f"right/{_rectified_name(right_file)}"), right_image)
         plan.write(run.content)
         first = read_pair(*images.pairs[0])
-        result = measure_epipolar(plan, first)
-        summary = result.summary
-        summary["pairs"] = len(images.pairs)
-        summary["frames_left_out"] = len(images.lonely)
-        summary["warnings"] = _warnings(summary, images)
-        with run.report(summary):
+        result = measure_epipolar(plan, first, images)
+        with run.report(result.summary) as summary:
             write_epipolar_images(result, run)
         inputs = [file for files in images.pairs for file in files]
         inputs += [] if calibration is None else [calibration]
-        run.finish(summary, source=f"{left} {right}", inputs=inputs)
-    return result
+        summary = run.finish(summary, source=f"{left} {right}", inputs=inputs)
+    return replace(result, summary=summary)
 
 
 def _rectified_name(path: Path) -> str:
     """Return the name of an image in its own file type; PNG for the types that are not written."""
     return path.name if path.suffix.lower() in _KEPT_TYPES else f"{path.stem}.png"
-
-
-def _warnings(summary: dict[str, Any], images: ImagePairs) -> list[str]:
-    lines = []
-    if summary["up_to_scale"]:
-        lines.append("without a calibration: rows correspond, but depth is up to scale, no metres")
-    if summary.get("model") == "raw":
-        lines.append("rows correspond as recorded: the images are written unchanged")
-    if summary.get("epipolar_error_px", 0.0) > _WARN_EPIPOLAR_PX:
-        lines.append(f"rows are {summary['epipolar_error_px']:.2f} px apart: a matcher needs 0.5")
-    if "epipolar_error_px" not in summary:
-        lines.append("no features to measure rows by")
-    if images.lonely:
-        names = ", ".join(path.name for path in images.lonely[:6])
-        lines.append(f"images without a partner, left out: {len(images.lonely)} ({names})")
-    if images.by_order:
-        lines.append("names do not tell which images belong together: paired by their order")
-    return lines
 
 
 def run_capture(
@@ -206,7 +177,7 @@ def run_capture(
     *,
     calibration: Path | None = None,
     stopped: Callable[[], bool] = lambda: False,
-) -> dict[str, Any]:
+) -> CaptureSummary:
     """Record until stopped; with a calibration, the folder can be mapped as it is.
 
     ``devices`` are left and right camera, or one with both views: numbers, paths or video files.
@@ -225,7 +196,7 @@ def record(
     settings: RecordingSettings,
     calibration: Path | None,
     stopped: Callable[[], bool],
-) -> dict[str, Any]:
+) -> CaptureSummary:
     """Record from opened cameras; see `run_capture`."""
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     with CaptureFolder(folder, settings.suffix) as target:
@@ -237,16 +208,16 @@ def record(
             shown = tracked(pairs, "pairs", "record", total=settings.frames)
             write_pairs(shown, target, settings.preview_every)
         finally:
-            summary = {
-                "started_utc": started,
-                "devices": [camera.name for camera in cameras],
-                "exposure_locked": locked,
-                **target.figures,
-                "calibration": calibration is not None,
-                "out": str(folder),
-            }
+            summary = CaptureSummary(
+                started_utc=started,
+                devices=[camera.name for camera in cameras],
+                exposure_locked=locked,
+                figures=target.figures,
+                calibration=calibration is not None,
+                out=str(folder),
+            )
             if target.frames:  # else it has no summary
-                text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
+                text = json.dumps(summary.to_json(), indent=2, allow_nan=False) + "\n"
                 write_text(folder / "capture.json", text)
     return summary
 
@@ -285,9 +256,8 @@ def run_audit(
         audit = replace(audit, corrected=correct_calibration(source, config, audit, Path(repair)))
     if out is not None:
         matcher = make_matcher(config.matching.matcher, config.matching, None)
-        summary = audit.summary
         with Run("audit", out, config) as run:
-            with run.report(summary):
+            with run.report(audit.summary) as summary:
                 write_audit_page(audit, source, matcher, run)
             record = {"warnings": [finding.text for finding in audit.findings]}
             run.finish(summary, source=source.name, inputs=source.files, record=record)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from recon.commands.config import run_settings
 from recon.commands.demo import demo_source
 from recon.core.errors import EvaluationError, SettingsError
 from recon.core.progress import stage
-from recon.core.text import counted, to_json
+from recon.core.text import counted
 from recon.core.values import (
     Disparity,
     DisparityTruth,
@@ -27,8 +26,6 @@ from recon.evaluation.disparity import evaluate_disparity
 from recon.evaluation.map import (
     LEAST_FRAMES,
     MapComparison,
-    ReferenceFrame,
-    add_within_reach,
     doubt_axes,
     doubts_of_file,
     evaluate_map,
@@ -38,10 +35,18 @@ from recon.evaluation.map import (
     place_cloud,
     possible_frames,
     read_mapped_cloud,
+    within_reach_too,
 )
 from recon.evaluation.middlebury.bench import unrated
 from recon.evaluation.middlebury.score import curve_figures, dense_map, named_figures
 from recon.evaluation.occupancy import evaluate_occupancy
+from recon.evaluation.summary import (
+    DisparityEvaluation,
+    MapEvaluation,
+    OccupancyEvaluation,
+    ReferenceFrame,
+    TrajectoryEvaluation,
+)
 from recon.evaluation.trajectory import (
     TOLERANCE_S,
     TrajectoryRules,
@@ -73,7 +78,7 @@ def run_evaluate_trajectory(
     times: Path | None = None,
     tolerance_s: float = TOLERANCE_S,
     out: Path | None = None,
-) -> dict[str, Any]:
+) -> TrajectoryEvaluation:
     """Compare two trajectory files: what `recon evaluate trajectory` does.
 
     Poses are associated by time if both files have timestamps, else in order; the paths are
@@ -84,34 +89,36 @@ def run_evaluate_trajectory(
     """
     stage("compare")
     ours, true, by_time = _read_paths(estimate, truth, times)
-    poses = {"estimate_poses": len(ours), "true_poses": len(true)}
-    fewer = min(poses.values())
+    poses = (len(ours), len(true))
+    fewer = min(poses)
     if by_time:
         ours, true = associate(ours, true, tolerance_s)
     comparison = compare_paths(ours, true, rules)
     few = f"a partner in time for only {len(true)} of {counted(fewer, 'pose')}; see --tolerance"
-    summary = {
-        **to_json(comparison.metrics),
-        "T_truth_estimate": comparison.motion.T_to_from.tolist(),
-        "rotation_deg": float(np.degrees(np.sqrt((comparison.rotation_errors_rad**2).mean()))),
-        "roll": "fixed" if comparison.roll_axis is None else "not observable on a straight path",
-        "associated": "by time" if by_time else "in order",
-        **poses,
-        "warnings": [
+    summary = TrajectoryEvaluation(
+        metrics=comparison.metrics,
+        T_truth_estimate=comparison.motion.T_to_from,
+        rotation_deg=float(np.degrees(np.sqrt((comparison.rotation_errors_rad**2).mean()))),
+        roll="fixed" if comparison.roll_axis is None else "not observable on a straight path",
+        associated="by time" if by_time else "in order",
+        estimate_poses=poses[0],
+        true_poses=poses[1],
+        warnings=[
             *doubts_of_file(estimate),
             *([few] if 2 * len(true) < fewer else ()),
             *interpolation_warnings(comparison.truth, comparison.segments),
         ],
-    }
-    if out is not None:
-        with Run("evaluate trajectory", out) as run:
-            write_tum(run.path("estimate_aligned_tum.txt"), comparison.estimate)
-            write_tum(run.path("truth_tum.txt"), comparison.truth)
-            with run.report(summary):
-                write_trajectory_page(comparison, (estimate.name, truth.name), summary, run)
-            inputs = [path for path in (estimate, truth, times) if path is not None]
-            run.finish(summary, source=str(estimate), inputs=inputs)
-    return summary
+    )
+    if out is None:
+        return summary
+    with Run("evaluate trajectory", out) as run:
+        write_tum(run.path("estimate_aligned_tum.txt"), comparison.estimate)
+        write_tum(run.path("truth_tum.txt"), comparison.truth)
+        with run.report(summary) as summary:
+            names = (estimate.name, truth.name)
+            write_trajectory_page(comparison, names, summary.to_json(), run)
+        inputs = [path for path in (estimate, truth, times) if path is not None]
+        return run.finish(summary, source=str(estimate), inputs=inputs)
 
 
 def _read_paths(
@@ -137,7 +144,7 @@ def run_evaluate_map(
     icp: bool = False,
     thresholds_m: Sequence[float] = (0.2,),
     out: Path | None = None,
-) -> dict[str, Any]:
+) -> MapEvaluation:
     """Compare a map with a reference cloud: what `recon evaluate map` does.
 
     Precision, recall and F-score are those of each threshold; with the path of a run also those of
@@ -167,27 +174,27 @@ def run_evaluate_map(
         else:
             placed, moved = place_cloud(mapped, frame or "camera", align_to)
         truth = replace(truth, frame=placed.cloud.frame)
-        by_threshold = [to_json(evaluate_map(placed.cloud, truth, limit)) for limit in thresholds_m]
-    beyond = add_within_reach(placed, truth, by_threshold)
+        found = [evaluate_map(placed.cloud, truth, limit) for limit in thresholds_m]
+    by_threshold, beyond_reach = within_reach_too(placed, truth, found)
     aligned = icp or align_to is not None
-    axes = moved.get("reference_frame", frame or "camera")
-    doubts = doubt_axes(placed, truth, by_threshold[0], axes, aligned=aligned)
-    summary = {
-        **by_threshold[0],
-        **moved,
-        **beyond,
-        "by_threshold": by_threshold,
-        "warnings": [*placed.doubts, *doubts],
-    }
-    if out is not None:
-        cloud = run / CLOUD if run.is_dir() else run
-        inputs = [path for path in (cloud, reference, align_to) if path is not None]
-        result = MapComparison(placed.cloud, truth, tuple(thresholds_m), summary)
-        with Run("evaluate map", out) as written:
-            with written.report(summary):
-                write_map_errors(result, written)
-            written.finish(summary, source=str(run), inputs=inputs)
-    return summary
+    doubts = doubt_axes(
+        placed, truth, found[0], moved.reference_frame or frame or "camera", aligned=aligned
+    )
+    summary = MapEvaluation(
+        first=by_threshold[0],
+        placement=moved,
+        beyond_reach=beyond_reach,
+        by_threshold=by_threshold,
+        warnings=[*placed.doubts, *doubts],
+    )
+    if out is None:
+        return summary
+    cloud = run / CLOUD if run.is_dir() else run
+    inputs = [path for path in (cloud, reference, align_to) if path is not None]
+    with Run("evaluate map", out) as written:
+        with written.report(summary) as summary:
+            write_map_errors(MapComparison(placed.cloud, truth, tuple(thresholds_m)), written)
+        return written.finish(summary, source=str(run), inputs=inputs)
 
 
 def run_evaluate_disparity(
@@ -197,7 +204,7 @@ def run_evaluate_disparity(
     *,
     scale: float = 1.0,
     confidence: Path | None = None,
-) -> dict[str, Any]:
+) -> DisparityEvaluation:
     """Compare one disparity map file (PFM or 16-bit PNG) with another: `recon evaluate disparity`.
 
     Args:
@@ -217,17 +224,18 @@ def run_evaluate_disparity(
     known = DisparityTruth(true, counted)
     found = evaluate_disparity(values, known, scale=scale)
     dense = evaluate_disparity(dense_map(values), known, scale=scale)
-    figures: dict[str, Any] = {
-        "pixels": found.pixels,
-        "invalid": found.invalid,
-        "sparse": {**named_figures(found), "d1": found.d1},
-        "dense": {**named_figures(dense), "d1": dense.d1},
-    }
+    rated = None
     if confidence is not None:
         compared = np.where(counted, true, np.float32(np.nan))
         measured = DisparityTruth(compared, np.isfinite(compared))
-        figures["confidence"] = curve_figures(_rated(values, confidence), measured, limit_px=1.0)
-    return dict(to_json(figures))
+        rated = curve_figures(_rated(values, confidence), measured, limit_px=1.0)
+    return DisparityEvaluation(
+        pixels=found.pixels,
+        invalid=found.invalid,
+        sparse={**named_figures(found), "d1": found.d1},
+        dense={**named_figures(dense), "d1": dense.d1},
+        confidence=rated,
+    )
 
 
 def _rated(values: Float32, path: Path) -> Disparity:
@@ -248,6 +256,11 @@ class OccupancyComparison:
     grid: OccupancyGrid
     truth: OccupancyTruth
     doubts: list[str]
+
+    @property
+    def summary(self) -> OccupancyEvaluation:
+        """What `recon evaluate occupancy` prints."""
+        return OccupancyEvaluation(metrics=self.metrics, warnings=self.doubts)
 
 
 def run_evaluate_occupancy(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
@@ -12,6 +13,7 @@ from recon.core.errors import SettingsError
 from recon.core.progress import Progress, series
 from recon.evaluation.middlebury.bench import (
     Bench,
+    MiddleburySummary,
     SceneDone,
     SceneFigures,
     check_folder,
@@ -22,7 +24,6 @@ from recon.evaluation.middlebury.bench import (
     read_scored_scene,
     summarise_scenes,
 )
-from recon.evaluation.middlebury.score import Figures
 from recon.io.files import StrPath
 from recon.io.images.disparity import write_pfm
 from recon.report.middlebury_page import draw_result, write_middlebury_page
@@ -42,7 +43,7 @@ def run_middlebury(
     threads: int | None = None,
     parallel: int = 1,
     auto_range: bool = False,
-) -> Figures:
+) -> MiddleburySummary:
     """Score matchers on Middlebury scenes: what `recon evaluate middlebury` does.
 
     Every scene is matched with each matcher, results of other programs are read beside, and all
@@ -61,9 +62,6 @@ def run_middlebury(
         parallel: Scenes processed at once, sharing the threads. Above 1, timings are those of a
             busy machine.
         auto_range: Whether the disparity range is estimated from each pair.
-
-    Returns:
-        The content of ``summary.json``.
 
     Raises:
         SettingsError: A matcher is unknown or named twice.
@@ -107,17 +105,20 @@ def run_middlebury(
         with series(str(folder), len(paths), "scenes") as shown:
             found = dict(_watched(score, paths, parallel, shown))
         summary = summarise_scenes(found, names, others, Path(folder))
-        summary |= {"threads": run.threads, "parallel": parallel}
-        if "onnx" in chosen:
-            summary["network"] = describe_network(config.matching.onnx)
-        with run.report(summary):
-            write_middlebury_page(summary, run)
+        network = describe_network(config.matching.onnx) if "onnx" in chosen else None
+        summary = replace(summary, threads=run.threads, parallel=parallel, network=network)
+        with run.report(summary) as summary:
+            write_middlebury_page(summary.to_json(), run)
         files = [file for path in paths.values() for file in sorted(path.iterdir())]
         files = [file for file in files if file.is_file()]
         files += [file for other in others for file in other.files.values()]
-        record = {key: summary[key] for key in ("folder", "results", "threads", "parallel")}
-        run.finish(summary, source=str(folder), inputs=files, record=record)
-    return summary
+        record = {
+            "folder": summary.folder,
+            "results": summary.results,
+            "threads": run.threads,
+            "parallel": parallel,
+        }
+        return run.finish(summary, source=str(folder), inputs=files, record=record)
 
 
 def _watched(

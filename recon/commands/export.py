@@ -15,12 +15,13 @@ from recon.commands.config import (
     load_config,
     run_settings,
 )
+from recon.commands.map_summary import CloudSummary, ExportSummary
 from recon.core.errors import FormatError, SettingsError
 from recon.core.machine import available_cores
 from recon.export.control import locate
 from recon.export.make import PRODUCTS, check_target, known_products, make, need_rays, write_product
 from recon.export.mesh.pieces import LAYER, WHOLE
-from recon.export.pair import PAIR_CLOUD, mesh_cloud, write_surface
+from recon.export.pair import PAIR_CLOUD, check_coverage, mesh_cloud, write_surface
 from recon.export.product import ExportContext, ExportResult, open_images
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath, naming, reading, resolved
@@ -59,7 +60,7 @@ def run_export(
     survey: Survey | None = None,
     images: Sequence[Path] = (),
     command: str = "export",
-) -> dict[str, Any]:
+) -> ExportSummary | CloudSummary:
     """Make products of a finished run, and write them: what `recon export` does.
 
     Args:
@@ -75,9 +76,6 @@ def run_export(
             those of the map.
         images: Where drives are now whose images are needed, if not where they were mapped.
         command: Command name, for the record and the default folder.
-
-    Returns:
-        The figures of ``summary.json``.
 
     Raises:
         ReconError: There is no such product, the run is damaged or lacks what a product is made
@@ -103,8 +101,7 @@ def run_export(
     settings = config or ran
     if mapped_by is None:
         with Run(command, out, settings, threads=threads) as run:
-            more = {"run": str(source), "warnings": []}
-            return _of_cloud(source, run, settings, formats, more, wanted)
+            return _of_cloud(source, run, settings, formats, wanted, of_run=str(source))
     check_changes(ran, settings, (*(REMADE if need_rays(wanted) else ()), "mesh"))
     with Map.open(source) as map_, Run(command, out, settings, threads=threads) as run:
         if any(PRODUCTS[name].needs_images for name in wanted):
@@ -117,18 +114,17 @@ def run_export(
                 there = locate(map_, survey, images, run.threads)
         context = ExportContext(map_, placed, settings.mesh, formats, run.threads, there, images)
         made = make(context, run.content, wanted, run.watch)
-        doubts, T_map_world = map_.doubts, map_.first.T_map_world.tolist()
-        figures = {
-            "run": str(source),
-            "frames": len(placed.path_m),
-            **({} if there is None else there.figures()),
-            **made.figures,
-            "T_map_world": T_map_world,
-            "warnings": [*doubts, *(() if there is None else there.warnings()), *made.warnings],
-        }
-        record = {MAPPED_BY: mapped_by, "T_map_world": T_map_world, DOUBTS: doubts}
-        run.finish(figures, source=str(source), inputs=[source / MAP_FILE], record=record)
-    return figures
+        doubts, T_map_world = map_.doubts, map_.first.T_map_world
+        summary = ExportSummary(
+            run=str(source),
+            frames=len(placed.path_m),
+            survey=None if there is None else there.figures(),
+            products=made.figures,
+            T_map_world=T_map_world,
+            warnings=[*doubts, *(() if there is None else there.warnings()), *made.warnings],
+        )
+        record = {MAPPED_BY: mapped_by, "T_map_world": T_map_world.tolist(), DOUBTS: doubts}
+        return run.finish(summary, source=str(source), inputs=[source / MAP_FILE], record=record)
 
 
 def _placed(map_: Map, settings: ReconConfig, run: Run, workers: BatchOptions | None) -> PlacedMap:
@@ -161,7 +157,7 @@ def export_map(
         threads: Threads to use; None = all cores.
 
     Returns:
-        Its ``figures``, as in the summary of a run, ``warnings``, and its ``value`` if it is one.
+        Its ``figures``, ``warnings``, and its ``value`` if it is one.
         All is in map axes; `run_export` writes products in the coordinates of a survey.
 
     Raises:
@@ -200,7 +196,7 @@ def run_mesh(
     formats: Sequence[str] = ("ply",),
     out: Path | None = None,
     threads: int | None = None,
-) -> dict[str, Any]:
+) -> ExportSummary | CloudSummary:
     """Reconstruct the surface of a cloud file or of a run's map, and write a MeshLab project.
 
     A cloud file is meshed in one piece, since its scale is unknown; the cloud of a pair as
@@ -212,8 +208,15 @@ def run_mesh(
         refuse_as_target(source, out)
         if not is_pair_run(source):
             settings = run_settings(source).model_copy(update={"mesh": config.mesh})
-            how: Any = {"out": out, "threads": threads, "command": "mesh"}
-            return run_export(source, settings, products=["mesh"], formats=formats, **how)
+            return run_export(
+                source,
+                settings,
+                products=["mesh"],
+                formats=formats,
+                out=out,
+                threads=threads,
+                command="mesh",
+            )
     with Run("mesh", out, config, threads=threads) as run:
         return _of_cloud(source, run, config, formats)
 
@@ -223,16 +226,13 @@ def _of_cloud(
     run: Run,
     config: ReconConfig,
     formats: Sequence[str],
-    more: Mapping[str, Any] = {},
     products: Sequence[str] = ("mesh",),
-) -> dict[str, Any]:
-    """Make products of a cloud file, or of the cloud in a run of `recon pair`, and end the run.
-
-    There are ``more`` figures to its summary.
-    """
+    of_run: str | None = None,
+) -> CloudSummary:
+    """Make products of a cloud file, or of the cloud in a run of `recon pair`, and end the run."""
     camera = camera_of_pair(source) if source.is_dir() else None
     cloud = source / PAIR_CLOUD if source.is_dir() else source
-    figures = {"cloud": str(cloud), **more}
+    summary = CloudSummary(cloud=str(cloud), run=of_run)
     if "cloud" in products:
         with reading(cloud):
             cloud.stat()
@@ -245,9 +245,10 @@ def _of_cloud(
         with run.stage("mesh"), naming(cloud):
             mesh, made = mesh_cloud(points, camera, config.mesh, source)
         write_surface(mesh, camera, layer, formats, run.path(WHOLE))
-        figures |= made
-    run.finish(figures, source=str(source), inputs=[cloud])
-    return figures
+        covered = made.mesh_coverage
+        lacks = () if covered is None else check_coverage(covered)
+        summary = replace(summary, mesh=made, warnings=lacks)
+    return run.finish(summary, source=str(source), inputs=[cloud])
 
 
 def run_occupancy(
@@ -256,7 +257,7 @@ def run_occupancy(
     *,
     out: StrPath | None = None,
     threads: int | None = None,
-) -> dict[str, Any]:
+) -> ExportSummary | CloudSummary:
     """Make voxels and grid of a run with other settings: what `recon occupancy` does.
 
     The arguments and errors are those of `run_export`; ``run`` is the folder of a run that mapped a

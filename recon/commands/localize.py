@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import as_line, faults_of, look_first, run_map
 from recon.commands.map_options import MapOptions
+from recon.commands.map_summary import MapSummary
 from recon.core.errors import MappingError, SettingsError
 from recon.core.progress import Silent, showing, stage
 from recon.core.values import Recorded
@@ -22,7 +23,12 @@ from recon.look.look import look_at
 from recon.map.drive.drive import Workspace
 from recon.map.drive.scale import measure_scene
 from recon.map.drive.sequence import map_sequence
-from recon.map.localize.sequence import LocalizeResult, StartPose, localize_sequence
+from recon.map.localize.sequence import (
+    LocalizeResult,
+    LocalizeSummary,
+    StartPose,
+    localize_sequence,
+)
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
@@ -67,33 +73,37 @@ def run_localize(
         before = look_first(source, config, options, run, map_.known_rig(source.calibration))
         rig, source = before.rig, before.drive
         workspace = Workspace(map_, run.watch, run.threads)
-        T_map_world = map_.first.T_map_world.tolist()
-        where = {"map_run": str(map_path), "T_map_world": T_map_world}
+        where = {"map_run": str(map_path), "T_map_world": map_.first.T_map_world.tolist()}
         write_json(run.state(SUMMARY), where)
-        how: Any = {"start": start, "note": begin_states(run.state(STATES))}
+        note = begin_states(run.state(STATES))
         options.begun(run.folder)
-        drive = localize_sequence(source, workspace, config, **how)
+        drive = localize_sequence(source, workspace, config, start=start, note=note)
         has_grid = folder is not None and (folder / GRID).is_file()
         grid = read_grid(map_path / GRID) if has_grid else None
-        made = LocalizeResult(source.name, str(map_path), drive, grid)
-        made.summary.update(source=source.name, **where, **drive.figures())
         seen = [
             *before.findings,
             *rig.warnings(before.findings),
             *drive.warnings(),
             *source.warnings(),
         ]
-        warnings = [*before.look.first, *map_.doubts, *seen]
-        made.summary["warnings"], made.summary["rig"] = warnings, rig.figures()
-        made.summary.update(source.figures())
+        summary = LocalizeSummary(
+            source=source.name,
+            map_run=str(map_path),
+            T_map_world=map_.first.T_map_world,
+            drive=drive.figures(),
+            rig=rig.figures(),
+            read=source.figures(),
+            warnings=[*before.look.first, *map_.doubts, *seen],
+        )
+        made = LocalizeResult(source.name, str(map_path), drive, grid, summary)
         with run.stage("write"):
             height_m = None if folder is None else figure_of(folder, "camera_height_m")
             export_localized(drive, height_m, run.content)
             write_states(run.path(STATES), drive.frames)
-        with run.report(made.summary):
-            write_localize_page(made, run)
-        run.finish(made.summary, source=source.name, inputs=inputs)
-    return made
+        with run.report(summary) as summary:
+            write_localize_page(replace(made, summary=summary), run)
+        summary = run.finish(summary, source=source.name, inputs=inputs)
+    return replace(made, summary=summary)
 
 
 _SLOWEST: Final = 1e-3
@@ -112,7 +122,7 @@ def run_live(
     map_path: StrPath | None = None,
     start: StartPose | None = None,
     stopped: Callable[[], bool] = lambda: False,
-) -> dict[str, Any]:
+) -> MapSummary | LocalizeSummary:
     """Map a drive while its images arrive: what `recon live` does.
 
     The pose of each frame comes first, from its features alone; matching follows as far as there
@@ -128,7 +138,7 @@ def run_live(
         stopped: Asked now and then; True ends the drive, whose map is then completed.
 
     Returns:
-        The figures of ``summary.json``.
+        What `run_map` or `run_localize` found.
 
     Raises:
         ReconError: As for `run_map` and `run_localize`; the rate is not positive, or the odometry

@@ -7,12 +7,13 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.kernels import compile_kernels
 from recon.commands.map_options import MapOptions
 from recon.commands.map_pieces import begun_in_pieces, map_pieces, pieces_of
+from recon.commands.map_summary import MapSummary, PriorFigures, UsualProducts
 from recon.core.errors import (
     ClusterError,
     MemoryLimitError,
@@ -22,13 +23,8 @@ from recon.core.errors import (
     SourceError,
 )
 from recon.core.plugins import name_of
-from recon.core.text import counted, to_json
-from recon.core.values import (
-    OccupancyGrid,
-    PointCloud,
-    TrajectoryMetrics,
-    TriangleMesh,
-)
+from recon.core.text import counted
+from recon.core.values import OccupancyGrid, PointCloud, TrajectoryMetrics, TriangleMesh
 from recon.evaluation.map import DriveErrors, compare_with_truth
 from recon.export.make import Products, make
 from recon.export.product import ExportContext
@@ -66,7 +62,7 @@ class MapResult:
     mapped: MappedSequence  # the drive: its map, and what it cost
     made: Products  # what is left in memory of what was made of the map
     errors: DriveErrors  # errors against the truth, as far as the source knows it
-    summary: dict[str, Any]  # the figures of ``summary.json``
+    summary: MapSummary
 
     @property
     def cloud(self) -> PointCloud:
@@ -91,11 +87,11 @@ class MapResult:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Problems that did not stop the run."""
-        return tuple(self.summary["warnings"])
+        return tuple(self.summary.warnings)
 
     def __repr__(self) -> str:
         made = f"{self.mapped}, {self.grid}, {self.mesh}"
-        name, warnings = self.summary["source"], counted(len(self.warnings), "warning")
+        name, warnings = self.summary.source, counted(len(self.warnings), "warning")
         return f"MapRun({name!r}, {made}, {warnings})"
 
 
@@ -149,27 +145,35 @@ def run_map(
         first = [] if mapped.sfm is None else mapped.sfm.warnings()
         known = [*first, *breaks, *findings]
         warnings = [*seen.look.first, *known, *doubts, *made.warnings, *errors.warnings]
-        result = MapResult(mapped, made, errors, {})
-        result.summary.update(_summary(source, result, warnings, options, drift), rig=rig.figures())
-        result.summary["typical_depth_m"] = scene.depth_m
+        summary = _summary(
+            source,
+            options,
+            mapped,
+            made,
+            errors,
+            drift=drift,
+            rig=rig,
+            depth_m=scene.depth_m,
+            warnings=warnings,
+        )
         with run.stage("write"):
             export_paths(map_.first, mapped.joined, made.camera_height_m, run.content)
             keep_map(map_, run.path(MAP_FILE))
-        with run.report(result.summary):
+        with run.report(summary) as summary:
             # Its figures take long to load, and the drive is mapped without them.
             from recon.report.map_page import map_content  # noqa: PLC0415
             from recon.report.page import write_page  # noqa: PLC0415
 
             shown = map_content(map_, made, errors, mapped.sample, rig)
-            write_page("map", run, result.summary, **shown)
+            write_page("map", run, summary.to_json(), **shown)
         config.memory.check("report")
         record = {
             "source_description": source.description,
             "T_map_world": mapped.T_map_world.tolist(),
             **pieces_of(run, map_),
         }
-        run.finish(result.summary, source=source.name, inputs=source.files, record=record)
-    return result
+        summary = run.finish(summary, source=source.name, inputs=source.files, record=record)
+    return MapResult(mapped, made, errors, summary)
 
 
 def refuse_with_sfm(source: StereoSource, options: MapOptions) -> None:
@@ -327,40 +331,46 @@ def _warnings(
 
 def _summary(
     source: StereoSource,
-    result: MapResult,
-    warnings: list[str],
     options: MapOptions,
+    mapped: MappedSequence,
+    made: Products,
+    errors: DriveErrors,
+    *,
     drift: ExpectedDrift | None,
-) -> dict[str, Any]:
-    mapped, errors, given = result.mapped, result.errors, options.known_poses is not None
-    frames, prior = len(mapped.trajectory), mapped.prior
-    known = {"trajectory": errors.path, "map": errors.surface, "occupancy": errors.occupancy}
-    return {
-        "odometry": "known poses" if given else name_of(mapped.config.odometry.method),
-        "source": source.name,
-        "frames": frames,
-        "fps": frames / mapped.seconds if mapped.seconds > 0 else None,
-        "frames_joined": int(mapped.joined.sum()),
-        "segments": [to_json(segment) for segment in mapped.segments],
-        "path_length_m": mapped.trajectory.select(mapped.joined).path_length_m,
-        "expected_drift_percent": None if drift is None else drift.percent,
-        "expected_drift_rig_percent": None if drift is None else drift.rig_percent,
-        "frames_not_trusted": int((~mapped.trusted).sum()),
-        "focal_px": mapped.camera.focal_px,
-        "field_of_view_deg": mapped.camera.field_of_view_deg,
-        "T_map_world": mapped.T_map_world.tolist(),
-        "scale": mapped.config.scale,
-        "voxel_m": mapped.config.fusion.voxel_m,
-        "faces": 0,
-        **result.made.figures,
-        "warnings": warnings,
-        **({} if mapped.loops is None else {"loops": mapped.loops.figures()}),
-        **({} if mapped.imu is None else {"imu": to_json(mapped.imu.summary())}),
-        **({} if mapped.sfm is None else {"sfm": mapped.sfm.figures()}),
-        **{name: to_json(found) for name, found in known.items() if found is not None},
-        **source.figures(),
-        **({} if prior is None else {"prior": {"from": options.prior_origin, **to_json(prior)}}),
-    }
+    rig: RefinedRig,
+    depth_m: float | None,
+    warnings: list[str],
+) -> MapSummary:
+    frames, prior, given = len(mapped.trajectory), mapped.prior, options.known_poses is not None
+    return MapSummary(
+        odometry="known poses" if given else name_of(mapped.config.odometry.method),
+        source=source.name,
+        frames=frames,
+        fps=frames / mapped.seconds if mapped.seconds > 0 else None,
+        frames_joined=int(mapped.joined.sum()),
+        segments=mapped.segments,
+        path_length_m=mapped.trajectory.select(mapped.joined).path_length_m,
+        expected_drift_percent=None if drift is None else drift.percent,
+        expected_drift_rig_percent=None if drift is None else drift.rig_percent,
+        frames_not_trusted=int((~mapped.trusted).sum()),
+        focal_px=mapped.camera.focal_px,
+        field_of_view_deg=mapped.camera.field_of_view_deg,
+        T_map_world=mapped.T_map_world,
+        scale=mapped.config.scale,
+        voxel_m=mapped.config.fusion.voxel_m,
+        typical_depth_m=depth_m,
+        made=UsualProducts.of(made),
+        rig=rig.figures(),
+        loops=None if mapped.loops is None else mapped.loops.figures(),
+        imu=None if mapped.imu is None else mapped.imu.figures(),
+        sfm=None if mapped.sfm is None else mapped.sfm.figures(),
+        trajectory=errors.path,
+        map=errors.surface,
+        occupancy=errors.occupancy,
+        read=source.figures(),
+        prior=None if prior is None else PriorFigures(origin=options.prior_origin, use=prior),
+        warnings=warnings,
+    )
 
 
 @contextmanager

@@ -157,8 +157,7 @@ class MapOptions:
 
     def run(self, config: ReconConfig) -> Run:
         """Return the run, which begins when it is entered."""
-        how: Any = {"threads": self.threads, "resume": self.resume}
-        return Run(self.command, self.out, config, **how)
+        return Run(self.command, self.out, config, threads=self.threads, resume=self.resume)
 
     def begin(self, run: Run, source: StereoSource, config: ReconConfig) -> Map:
         """Begin the map of a run; of one that is resumed, open it if nothing has changed."""

@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from recon.commands.config import ReconConfig
 from recon.commands.map_options import MapOptions
+from recon.commands.map_summary import PieceSummary
 from recon.core.errors import ClusterError, RegistrationError, SettingsError
 from recon.io.atomic import write_text
 from recon.io.cameras.calibration import read_recon_calibration, write_recon_calibration
@@ -113,7 +114,7 @@ def read_plan(plan: Path) -> tuple[list[Piece], dict[str, Any], dict[str, Any]]:
         return [Piece(*piece) for piece in pieces], arguments, config
 
 
-def run_piece(plan: Path, number: int, options: MapOptions) -> dict[str, Any]:
+def run_piece(plan: Path, number: int, options: MapOptions) -> PieceSummary:
     """Map a piece of a drive, or go on with it: what the jobs do."""
     pieces, arguments, settings = read_plan(plan)
     # Loops are looked for in the whole drive.
@@ -127,9 +128,7 @@ def run_piece(plan: Path, number: int, options: MapOptions) -> dict[str, Any]:
         work = Workspace(map_, run.watch, run.threads)
         map_sequence(part, config, workspace=work)
         keep_map(map_, run.path(MAP_FILE))
-        summary = {"frames": len(part), "warnings": []}
-        run.finish(summary, source=part.name, inputs=())
-    return summary
+        return run.finish(PieceSummary(frames=len(part)), source=part.name, inputs=())
 
 
 def _refuse_what_does_not_combine(config: ReconConfig, options: MapOptions) -> None:

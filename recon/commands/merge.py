@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from recon.commands.config import ReconConfig, check_changes, run_settings
 from recon.commands.export import REMADE
 from recon.commands.map import look_first, map_drive
 from recon.commands.map_options import MapOptions
+from recon.commands.map_summary import JoinedDrive, JoinedSummary, LinkFigures, UsualProducts
 from recon.core.errors import FormatError, ReconError, SettingsError
 from recon.export.make import make
 from recon.export.product import ExportContext
@@ -48,7 +50,7 @@ def run_merge(
     config: ReconConfig | None = None,
     options: MapOptions | None = None,
     survey: Survey | None = None,
-) -> dict[str, Any]:
+) -> JoinedSummary:
     """Make one map of several runs, or hold runs at measured positions: what `recon merge` does.
 
     The drives are linked by places that two of them saw, and placed in one pose graph; cloud,
@@ -61,9 +63,6 @@ def run_merge(
         options: Folder, threads and mesh of the run; None = the defaults.
         survey: Positions that were measured during drives, whose paths are optimised to run through
             them; None = none.
-
-    Returns:
-        The figures of ``summary.json``.
 
     Raises:
         ReconError: A run is missing, unfinished or twice in the list, kept no rays, has voxels of
@@ -91,7 +90,7 @@ def run_merge(
 
 def run_map_into(
     folder: Path, source: StereoSource, config: ReconConfig | None, options: MapOptions
-) -> dict[str, Any]:
+) -> JoinedSummary:
     """Map a drive into the map of a finished run: what `recon map SOURCE --into RUN` does.
 
     The folder is replaced in one step when all is done; until then it keeps the run as it was.
@@ -124,7 +123,7 @@ def run_map_into(
 
 def run_remove(
     folder: Path, number: int, config: ReconConfig | None, options: MapOptions
-) -> dict[str, Any]:
+) -> JoinedSummary:
     """Take a drive out of the map of a run: what `recon map --into RUN --remove SESSION` does.
 
     Its number is that of ``sessions`` in the summary; the folder is replaced in one step.
@@ -148,7 +147,7 @@ def _make_joined(
     inputs: Sequence[Path],
     replaced: Path | None = None,
     survey: Survey | None = None,
-) -> dict[str, Any]:
+) -> JoinedSummary:
     """Fill the map of a run, which may replace another, link and place its drives, and report."""
     out = replaced or options.out
     with (
@@ -165,43 +164,45 @@ def _make_joined(
             placed = place_map(map_, settings, run.threads)
         context = ExportContext(map_, placed, settings.mesh, threads=run.threads)
         made = make(context, run.content, options.products, run.watch)
-        axes = {"T_map_world": map_.first.T_map_world.tolist()}
-        summary = {**_figures(map_), **made.figures, **axes}
-        summary["warnings"] = [*left_out, *_warnings(map_), *_of_rigs(map_, new), *made.warnings]
+        summary = replace(
+            _figures(map_, UsualProducts.of(made)),
+            warnings=[*left_out, *_warnings(map_), *_of_rigs(map_, new), *made.warnings],
+        )
         export_sessions(map_, run.content)
-        with run.report(summary):
-            write_joined_page(map_, made, summary, run)
+        with run.report(summary) as summary:
+            write_joined_page(map_, made, summary.to_json(), run)
         map_.close()
-        names = ", ".join(session["name"] for session in summary["sessions"])
-        run.finish(summary, source=names, inputs=inputs, record=axes)
-    return summary
+        names, axes = ", ".join(drive.name for drive in summary.sessions), summary.T_map_world
+        record = {"T_map_world": axes.tolist()}
+        return run.finish(summary, source=names, inputs=inputs, record=record)
 
 
-def _figures(map_: Map) -> dict[str, Any]:
+def _figures(map_: Map, made: UsualProducts) -> JoinedSummary:
     placed = map_.placed
     kept = [link for link in map_.links if link.kept]
     pairs = Counter("-".join(map(str, link.sessions)) for link in kept)
-    return {
-        "frames": sum(map(len, map_.linked)),
-        "path_length_m": sum(path.path_length_m for path in map_.paths.values()),
-        "sessions": [
-            {
-                "number": session.number,
-                "name": session.info.source,
-                "frames": len(session),
-                "length_m": session.trajectory.path_length_m,
-                "linked": session.number in placed,
-                "frames_not_trusted": int((~session.trusted).sum()),
-                "frames_placed": int(placed.get(session.number, np.zeros(0)).sum()),
-                "positions": len(session.fixes),
-                "rig": None if (rig := _rig_of(session)) is None else rig.figures(),
-            }
+    return JoinedSummary(
+        frames=sum(map(len, map_.linked)),
+        path_length_m=sum(path.path_length_m for path in map_.paths.values()),
+        sessions=[
+            JoinedDrive(
+                number=session.number,
+                name=session.info.source,
+                frames=len(session),
+                length_m=session.trajectory.path_length_m,
+                linked=session.number in placed,
+                frames_not_trusted=int((~session.trusted).sum()),
+                frames_placed=int(placed.get(session.number, np.zeros(0)).sum()),
+                positions=len(session.fixes),
+                rig=None if (rig := _rig_of(session)) is None else rig.figures(),
+            )
             for session in map_.sessions
         ],
-        "links": {"count": len(kept), "refused": len(map_.links) - len(kept), "pairs": dict(pairs)},
-        "positions_misfit_rms_m": misfit_rms_m(map_),
-        "faces": 0,
-    }
+        links=LinkFigures(len(kept), len(map_.links) - len(kept), pairs),
+        positions_misfit_rms_m=misfit_rms_m(map_),
+        made=made,
+        T_map_world=map_.first.T_map_world,
+    )
 
 
 def _rig_of(session: Session) -> RefinedRig | None:

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from typing_extensions import Self
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.commands.kernels import compile_kernels
 from recon.core.errors import SettingsError
 from recon.core.plugins import name_of
 from recon.core.progress import stage
-from recon.core.text import to_json
 from recon.core.values import (
     Disparity,
+    DisparityMetrics,
+    DisparityTruth,
     Reason,
     Rectified,
     RectifiedCamera,
@@ -24,7 +26,14 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.core.values.arrays import UInt8
-from recon.evaluation.disparity import evaluate_disparity, evaluate_kinds
+from recon.evaluation.disparity import Kind, evaluate_disparity, evaluate_kinds
+from recon.evaluation.pair_summary import (
+    DisparityAccuracy,
+    DisparityFigures,
+    DisparitySummary,
+    PairCloud,
+    PairSummary,
+)
 from recon.export.pair import mesh_frame, write_cloud_files, write_disparity_files
 from recon.io.cameras.calibration import read_calibration
 from recon.io.files import StrPath, naming
@@ -88,20 +97,22 @@ def run_pair(
         with run.stage("write"):
             scale = write_disparity_files(frame.disparity, run.content, frame.pair.camera)
             write_cloud_files(frame, mesh, formats, run.content)
-        figures = {
-            **_cloud_figures(frame),
-            "faces": 0 if mesh is None else len(mesh.faces),
-            "mesh_coverage": coverage,
-            "up_to_scale": given.up_to_scale,
-            "disparity_png_scale": scale,
-        }
-        warnings = (*given.notes, *found, *frame.warnings, *unmeshed)
-        result = _compared(given, config, (frame.pair, frame.disparity), figures, warnings)
+        warnings = [*given.notes, *found, *frame.warnings, *unmeshed, *_idle(config.matching)]
+        errors = _Errors.of(frame.disparity, given.truth)
+        summary = PairSummary(
+            disparity=_figures(given.pair.name, frame.disparity, errors, config, scale),
+            cloud=_cloud_figures(frame),
+            faces=0 if mesh is None else len(mesh.faces),
+            mesh_coverage=coverage,
+            up_to_scale=given.up_to_scale,
+            warnings=warnings,
+        )
+        result = _result(given, config, (frame.pair, frame.disparity), errors, summary)
         result = replace(result, cloud=frame.cloud, mesh=mesh)
-        with run.report(result.summary):
-            write_pair_page(result, run)
-        run.finish(result.summary, source=result.name, inputs=given.files)
-    return result
+        with run.report(summary) as summary:
+            write_pair_page(replace(result, summary=summary), run)
+        summary = run.finish(summary, source=result.name, inputs=given.files)
+    return replace(result, summary=summary)
 
 
 def run_disparity(
@@ -125,37 +136,51 @@ def run_disparity(
         inspected, support = reconstructor.inspect(pair)
         found = check_found(disparity, given.pair.name, support, faults)
         with run.stage("write"):
-            figures = {"disparity_png_scale": write_disparity_files(disparity, run.content)}
-        warnings = (*given.notes, *found, *inspected)
-        result = _compared(given, config, (pair, disparity), figures, warnings)
-        with run.report(result.summary):
+            scale = write_disparity_files(disparity, run.content)
+        errors = _Errors.of(disparity, given.truth)
+        summary = DisparitySummary(
+            disparity=_figures(given.pair.name, disparity, errors, config, scale),
+            warnings=[*given.notes, *found, *inspected, *_idle(config.matching)],
+        )
+        result = _result(given, config, (pair, disparity), errors, summary)
+        with run.report(summary) as summary:
             write_disparity_images(result, run)
-        run.finish(result.summary, source=result.name, inputs=given.files)
-    return result
+        summary = run.finish(summary, source=result.name, inputs=given.files)
+    return replace(result, summary=summary)
 
 
-def _compared(
+@dataclass(frozen=True)
+class _Errors:
+    """Errors against the truth: of all pixels, and of measured and inferred ones alone."""
+
+    every: DisparityMetrics
+    by_kind: Mapping[Kind, DisparityMetrics]
+
+    @classmethod
+    def of(cls, disparity: Disparity, truth: DisparityTruth | None) -> Self | None:
+        """Return the errors; None = the truth is not known."""
+        if truth is None:
+            return None
+        return cls(evaluate_disparity(disparity, truth), evaluate_kinds(disparity, truth))
+
+
+def _result(
     given: PairInput,
     config: ReconConfig,
     matched: tuple[Rectified, Disparity],
-    figures: dict[str, Any],
-    warnings: tuple[str, ...],
+    errors: _Errors | None,
+    summary: DisparitySummary | PairSummary,
 ) -> PairResult:
-    """Return the results of a run, compared with the truth if it is known."""
-    (pair, disparity), name = matched, given.pair.name
-    warnings = (*warnings, *_idle_settings(config.matching))
-    metrics = None if given.truth is None else evaluate_disparity(disparity, given.truth)
-    by_kind = {} if given.truth is None else evaluate_kinds(disparity, given.truth)
-    summary = {
-        "pair": name,
-        **_disparity_figures(disparity),
-        **({} if metrics is None else {"disparity": {**to_json(metrics), **to_json(by_kind)}}),
-        **_network_figures(config.matching),
-        **figures,
-        "warnings": list(warnings),
-    }
-    made: Any = {"truth": given.truth, "metrics": metrics, "by_kind": by_kind}
-    return PairResult(name, config, pair, disparity, summary, warnings=warnings, **made)
+    return PairResult(
+        given.pair.name,
+        config,
+        *matched,
+        summary,
+        truth=given.truth,
+        metrics=None if errors is None else errors.every,
+        by_kind={} if errors is None else errors.by_kind,
+        warnings=tuple(summary.warnings),
+    )
 
 
 def _reconstructor(given: PairInput, config: ReconConfig, run: Run) -> FrameReconstructor:
@@ -255,25 +280,35 @@ def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[s
     return {}
 
 
-def _disparity_figures(disparity: Disparity) -> dict[str, Any]:
-    """Return size, fraction of pixels for each reason, and median of a disparity, ready for JSON.
-
-    What was measured and what was inferred are counted apart; the median is of the former.
-    ``filled_percent`` is what ``inferred_percent`` was called.
-    """
+def _figures(
+    name: str,
+    disparity: Disparity,
+    errors: _Errors | None,
+    config: ReconConfig,
+    png_scale: float | None,
+) -> DisparityFigures:
     found = disparity.values[disparity.measured]
     ratios, inferred = disparity.reason_ratios, 100.0 * float(disparity.inferred.mean())
-    return {
-        "width_px": disparity.values.shape[1],
-        "height_px": disparity.values.shape[0],
-        "valid_percent": 100.0 * float(disparity.measured.mean()),
-        **dict.fromkeys(("inferred_percent", "filled_percent"), inferred),
-        "reasons_percent": {r.name.lower(): 100.0 * ratios.get(r, 0.0) for r in Reason},
-        "disparity_median_px": float(np.median(found)) if len(found) else None,
-    }
+    matching, accuracy = config.matching, None
+    if errors is not None:
+        kinds = (errors.by_kind.get("measured"), errors.by_kind.get("inferred"))
+        accuracy = DisparityAccuracy(errors.every, *kinds)
+    return DisparityFigures(
+        pair=name,
+        width_px=disparity.values.shape[1],
+        height_px=disparity.values.shape[0],
+        valid_percent=100.0 * float(disparity.measured.mean()),
+        inferred_percent=inferred,
+        filled_percent=inferred,
+        reasons_percent={r.name.lower(): 100.0 * ratios.get(r, 0.0) for r in Reason},
+        disparity_median_px=float(np.median(found)) if len(found) else None,
+        accuracy=accuracy,
+        network=describe_network(matching.onnx) if matching.matcher == "onnx" else None,
+        disparity_png_scale=png_scale,
+    )
 
 
-def _idle_settings(matching: MatchingSettings) -> tuple[str, ...]:
+def _idle(matching: MatchingSettings) -> tuple[str, ...]:
     """Return warnings of changed settings of matchers that are not used; the range is for all."""
     if not isinstance(settings_of(matching.matcher, matching), SearchSettings):
         return ()  # the range of such a matcher is that of `sad`
@@ -295,25 +330,17 @@ def _idle_settings(matching: MatchingSettings) -> tuple[str, ...]:
     return tuple(f"the settings of matching.{one} have no effect: {advice}" for one in named)
 
 
-def _network_figures(settings: MatchingSettings) -> dict[str, Any]:
-    return {"network": describe_network(settings.onnx)} if settings.matcher == "onnx" else {}
-
-
-def _cloud_figures(frame: ReconstructedFrame) -> dict[str, Any]:
-    """Return the number of points, median depth and camera of a frame, ready for JSON.
-
-    The median is of what was measured.
-    """
+def _cloud_figures(frame: ReconstructedFrame) -> PairCloud:
     camera, z = frame.pair.camera, frame.cloud.only_measured().xyz[:, 2]
     inferred = frame.cloud.inferred
-    return {
-        "points": len(frame.cloud),
-        **({} if inferred is None else {"inferred_points": int(inferred.sum())}),
-        "depth_median_m": float(np.median(z)) if len(z) else None,
-        "focal_px": camera.focal_px,
-        "field_of_view_deg": camera.field_of_view_deg,
-        "cx_px": camera.cx_px,
-        "cy_px": camera.cy_px,
-        "baseline_m": camera.baseline_m,
-        "doffs_px": camera.doffs_px,
-    }
+    return PairCloud(
+        points=len(frame.cloud),
+        inferred_points=None if inferred is None else int(inferred.sum()),
+        depth_median_m=float(np.median(z)) if len(z) else None,
+        focal_px=camera.focal_px,
+        field_of_view_deg=camera.field_of_view_deg,
+        cx_px=camera.cx_px,
+        cy_px=camera.cy_px,
+        baseline_m=camera.baseline_m,
+        doffs_px=camera.doffs_px,
+    )

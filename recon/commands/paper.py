@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.evaluation.paper import (
     CORRECTED,
     TITLES,
     Experiment,
+    ExperimentFigures,
     MethodResult,
+    PaperSummary,
     apply_method,
     read_experiments,
     table_1_row,
@@ -31,7 +32,7 @@ def run_paper(
     *,
     out: Path | None = None,
     threads: int | None = None,
-) -> dict[str, Any]:
+) -> PaperSummary:
     """Repeat experiments 2 to 4 of the seed paper: what `recon paper` does.
 
     Each method is applied to each scene, alone and with all patch sizes, and compared with the
@@ -54,28 +55,27 @@ def run_paper(
             with run.stage("write"):
                 _write_experiment(one, results, run)
             done.append((one, results))
-            figures[str(one.number)] = {
-                "scene": one.scene,
-                "width_px": one.camera.width_px,
-                "height_px": one.camera.height_px,
-                "methods": {result.method: result.figures for result in results},
-                "patches": tried,
-            }
-        summary: dict[str, Any] = {
-            "as_printed": config.paper.as_printed,
-            "table_1": [table_1_row(one) for one in experiments],
-            "experiments": figures,
-            "warnings": [
+            figures[str(one.number)] = ExperimentFigures(
+                scene=one.scene,
+                width_px=one.camera.width_px,
+                height_px=one.camera.height_px,
+                methods={result.method: result.figures for result in results},
+                patches=tried,
+            )
+        summary = PaperSummary(
+            as_printed=config.paper.as_printed,
+            table_1=[table_1_row(one) for one in experiments],
+            experiments=figures,
+            warnings=[
                 f"{one.scene} has no true disparity: nothing is compared with the truth"
                 for one in experiments
                 if one.truth is None
             ],
-        }
-        with run.report(summary):
-            write_paper_page(source, done, summary, run)
+        )
+        with run.report(summary) as summary:
+            write_paper_page(source, done, summary.to_json(), run)
         inputs = [file for one in experiments for file in one.files]
-        run.finish(summary, source=str(source), inputs=inputs)
-    return summary
+        return run.finish(summary, source=str(source), inputs=inputs)
 
 
 def _write_experiment(one: Experiment, results: list[MethodResult], run: Run) -> None:
@@ -91,21 +91,3 @@ def _write_experiment(one: Experiment, results: list[MethodResult], run: Run) ->
         write_ply(run.path(f"{folder}/cloud_ascii.ply"), result.cloud, ascii=True)
     layers = {each.method: run.path(f"{experiment}/{each.method}/cloud.ply") for each in results}
     write_mlp(run.path(f"{experiment}/clouds.mlp"), layers, "camera")
-
-
-def headline(summary: dict[str, Any]) -> dict[str, str]:
-    """Return one line for each experiment and method, for the command's table."""
-    return {
-        f"{number} {experiment['scene']}, {method}": _headline(figures)
-        for number, experiment in summary["experiments"].items()
-        for method, figures in experiment["methods"].items()
-    }
-
-
-def _headline(figures: dict[str, Any]) -> str:
-    parts = [f"{figures['valid_percent']:.1f} % of the pixels have a value"]
-    if figures["disparity"] is not None:
-        parts.append(f"{figures['disparity']['bad']['1.0']:.1f} % off by more than 1 px")
-    if figures["depth"] is not None:
-        parts.append(f"median depth error {figures['depth']['median_error_percent']:.2f} %")
-    return ", ".join(parts)

@@ -7,6 +7,7 @@
 - `lazy.py`: libraries, and what draws values, loaded when they are used;
 - `plugins.py`: parts that others write, registered by packages or given as objects;
 - `text.py`: numbers read from text and written with words and units;
+- `summary.py`: what a command found, as a value, and how it becomes JSON;
 - `progress.py`: who is told how far work is; `work.py`: threads, and seconds per stage;
   `machine.py`: cores, memory and its limit, versions;
 - `geometry/alignment.py`: least squares.

@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable
-from dataclasses import asdict, is_dataclass
-from typing import Any, Final
+from typing import Final
 
 _DECIMAL_COMMA: Final = re.compile(r"[-+]?\d+,\d+", re.ASCII)
 _MOST_DECIMALS: Final = 6  # of a length: micrometres are beyond every measurement here
@@ -100,16 +99,3 @@ def unit_of(name: str) -> str:
 def with_unit(text: str, name: str) -> str:
     """Return the text of a figure with its unit."""
     return f"{text} {unit_of(name)}".rstrip()
-
-
-def to_json(value: Any) -> Any:
-    """Convert a value for JSON: dataclasses to mappings, NaN and infinity to None."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return to_json(asdict(value))
-    if isinstance(value, dict):
-        return {str(key): to_json(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_json(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Bool, Float32, Float64
 from recon.evaluation.occupancy import evaluate_occupancy
+from recon.evaluation.summary import Placement, ReferenceFrame, ThresholdFigures
 from recon.evaluation.trajectory import TOLERANCE_S, associate, evaluate_trajectory
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import holds_times, read_trajectory
@@ -164,7 +165,6 @@ def _cloud(xyz: NDArray[Any]) -> Any:
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(xyz, dtype=np.float64)))
 
 
-ReferenceFrame = Literal["camera", "map"]
 # From half of either cloud near the other it is a fit; below a tenth of both it is none.
 _FITS, _HARDLY_MEETS = 0.5, 0.1
 
@@ -176,7 +176,6 @@ class MapComparison:
     cloud: PointCloud  # the estimate, in the axes of the reference, aligned
     reference: PointCloud
     thresholds_m: tuple[float, ...]  # distances below which a point counts as correct
-    summary: dict[str, Any]  # the figures of ``summary.json``
 
 
 class MapOfRun(NamedTuple):
@@ -226,7 +225,7 @@ def read_mapped_cloud(run: Path) -> MappedCloud:
 
 def place_cloud(
     mapped: MappedCloud, frame: ReferenceFrame, align_to: Path | None
-) -> tuple[MappedCloud, dict[str, Any]]:
+) -> tuple[MappedCloud, Placement]:
     """Bring a map into the axes of its reference; also return how it was aligned.
 
     ``align_to`` are true poses of the run's cameras in these axes, to which its path is aligned.
@@ -235,7 +234,7 @@ def place_cloud(
         what = "--align-to needs a reference in the axes of the poses"
         raise SettingsError(what, where="--reference-frame", got="map", expected="camera")
     T_map_world, T = mapped.T_map_world, np.eye(4)
-    how: dict[str, Any] = {"alignment": "none"}
+    how = Placement()
     if T_map_world is None and align_to is not None:
         what = "a cloud without a run has no path to align"
         raise EvaluationError(what, hint="give the folder of a run")
@@ -245,7 +244,8 @@ def place_cloud(
         return replace(mapped, path=_moved(mapped.path, T_map_world)), how
     if align_to is not None:
         T = _path_motion(mapped, align_to)
-        how = {"alignment": "poses", **_size("path", T)}
+        moved_m, turned_deg = _size(T)
+        how = Placement(alignment="poses", path_moved_m=moved_m, path_turned_deg=turned_deg)
     cloud = transform_cloud(mapped.cloud, T @ invert(T_map_world), frame="camera")
     return replace(mapped, cloud=cloud, path=_moved(mapped.path, T)), how
 
@@ -265,12 +265,12 @@ def place_by_icp(
     frames: Sequence[ReferenceFrame],
     align_to: Path | None,
     reach_m: float,
-) -> tuple[MappedCloud, dict[str, Any]]:
+) -> tuple[MappedCloud, Placement]:
     """Bring a map into the axes of its reference (`place_cloud`), and align it there by ICP.
 
     Of several ``frames`` it is that in which most points have a partner within ``reach_m``.
     """
-    found: list[tuple[MappedCloud, dict[str, Any]]] = []
+    found: list[tuple[MappedCloud, Placement]] = []
     for frame in frames:
         placed, how = place_cloud(mapped, frame, align_to)
         cloud, axes = placed.cloud, placed.cloud.frame
@@ -286,52 +286,60 @@ def place_by_icp(
         # Measured at the centre of the map: a rotation about a far origin would look like a shift.
         middle = np.eye(4)
         middle[:3, 3] = cloud.xyz.mean(axis=0, dtype=np.float64)
-        moved = {**_size("icp", invert(middle) @ T @ middle), "icp_ratio": ratio}
+        moved_m, turned_deg = _size(invert(middle) @ T @ middle)
+        moved = replace(how, icp_moved_m=moved_m, icp_turned_deg=turned_deg, icp_ratio=ratio)
         cloud, path = transform_cloud(cloud, T, frame=axes), _moved(placed.path, T)
         fitted = replace(placed, cloud=cloud, path=path)
-        found.append((fitted, {**how, "reference_frame": frame, **moved}))
-    return max(found, key=lambda each: each[1]["icp_ratio"])
+        found.append((fitted, replace(moved, reference_frame=frame)))
+    return max(found, key=lambda each: each[1].icp_ratio or 0.0)
 
 
-def add_within_reach(
-    mapped: MappedCloud, reference: PointCloud, by_threshold: Sequence[dict[str, Any]]
-) -> dict[str, Any]:
-    """Add the figures within reach of the reference, if the path is known; return the rest."""
+def within_reach_too(
+    mapped: MappedCloud, reference: PointCloud, found: Sequence[MapMetrics]
+) -> tuple[list[ThresholdFigures], float | None]:
+    """Add figures within reach of the reference, if the path is known; return also the rest.
+
+    That is the fraction of points beyond reach.
+    """
+    alone = [ThresholdFigures(metrics=one) for one in found]
     if mapped.path is None:
-        return {}
+        return alone, None
     judged = within_reach(mapped.cloud, reference, mapped.path)
     if not judged.any():
-        return {"beyond_reach": 1.0}
-    for found in by_threshold:
-        part = evaluate_map(mapped.cloud.select(judged), reference, found["threshold_m"])
-        found |= {"precision_in_reach": part.precision, "f_score_in_reach": part.f_score}
-    return {"beyond_reach": float(1 - judged.mean())}
+        return alone, 1.0
+    near = mapped.cloud.select(judged)
+    parts = [evaluate_map(near, reference, one.threshold_m) for one in found]
+    both = [
+        replace(one, precision_in_reach=part.precision, f_score_in_reach=part.f_score)
+        for one, part in zip(alone, parts, strict=True)
+    ]
+    return both, float(1 - judged.mean())
 
 
 def doubt_axes(
     mapped: MappedCloud,
     reference: PointCloud,
-    figures: Mapping[str, Any],
+    figures: MapMetrics,
     frame: ReferenceFrame,
     *,
     aligned: bool,
 ) -> list[str]:
     """Return warnings if the clouds are in different axes or far apart: useless figures."""
-    best = max(figures["precision"], figures["recall"])
+    best = max(figures.precision, figures.recall)
     if best >= _FITS:
         return []
     cloud, T = mapped.cloud, mapped.T_map_world
     if T is not None and not aligned:
         name, T_other = ("map", T) if frame == "camera" else ("camera", invert(T))
         moved = transform_cloud(cloud, T_other, frame=cloud.frame)
-        f_score = evaluate_map(moved, reference, figures["threshold_m"]).f_score
-        if f_score > max(2 * figures["f_score"], _HARDLY_MEETS):
+        f_score = evaluate_map(moved, reference, figures.threshold_m).f_score
+        if f_score > max(2 * figures.f_score, _HARDLY_MEETS):
             found = f"the reference seems to be in the axes of the {name}: there F would be"
             return [f"{found} {f_score:.2f}; use --reference-frame {name}"]
     if best >= _HARDLY_MEETS:
         return []
     advice = "check --reference-frame, or align them with --align-to or --align icp"
-    apart = f"the median distance is {figures['median_m']:.3g} m"
+    apart = f"the median distance is {figures.median_m:.3g} m"
     return [f"map and reference hardly meet: {apart}; {advice}"]
 
 
@@ -354,9 +362,9 @@ def _moved(path: Trajectory | None, T: Float64) -> Trajectory | None:
     return None if path is None else Trajectory(T @ path.T_world_camera, path.timestamps_s)
 
 
-def _size(name: str, T: Float64) -> dict[str, Any]:
-    moved_m, turned_deg = np.linalg.norm(T[:3, 3]), np.degrees(angle_rad(T))
-    return {f"{name}_moved_m": float(moved_m), f"{name}_turned_deg": float(turned_deg)}
+def _size(T: Float64) -> tuple[float, float]:
+    """Return by how many metres and degrees a transform moves and turns."""
+    return float(np.linalg.norm(T[:3, 3])), float(np.degrees(angle_rad(T)))
 
 
 _NEAR_M: Final = 0.2  # a map point of a road this near the true surface is correct

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -14,9 +14,11 @@ from pydantic import Field, field_validator
 
 from recon.core.errors import CalibrationError, MatchingError, SourceError
 from recon.core.settings import Settings
-from recon.core.text import to_json
+from recon.core.summary import Figures, Rows, RunSummary
+from recon.core.text import counted
 from recon.core.values import (
     Disparity,
+    DisparityMetrics,
     DisparityTruth,
     PointCloud,
     Reason,
@@ -88,6 +90,84 @@ class Experiment:
     files: tuple[Path, ...]
 
 
+@dataclass(frozen=True, kw_only=True)
+class DepthFigures(Figures):
+    """Depths beside the true ones, at pixels that both cameras see."""
+
+    median_m: float
+    true_median_m: float
+    median_error_percent: float  # median of the absolute error, per cent of the true depth
+    median_ratio: float  # of depth and true depth
+    pixels: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodFigures(Figures):
+    """What a method finds in a scene; None = there is no ground truth."""
+
+    valid_percent: float  # of the pixels, those with a value
+    points: int
+    depth_median_m: float | None
+    disparity: DisparityMetrics | None
+    depth: DepthFigures | None
+
+    @property
+    def text(self) -> str:
+        """The most important figures in a line."""
+        parts = [f"{self.valid_percent:.1f} % of the pixels have a value"]
+        if self.disparity is not None:
+            parts.append(f"{self.disparity.bad[1.0]:.1f} % off by more than 1 px")
+        if self.depth is not None:
+            parts.append(f"median depth error {self.depth.median_error_percent:.2f} %")
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True)
+class PatchFigures(Figures):
+    """Pixels with a value, wrong and right, in per cent, and the mean error by size of a patch."""
+
+    patch_px: int
+    valid_percent: float
+    bad_percent: float | None
+    right_percent: float | None
+    avgerr_px: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExperimentFigures(Figures):
+    """One experiment: each method, alone and with all patch sizes."""
+
+    scene: str
+    width_px: int
+    height_px: int
+    methods: Mapping[str, MethodFigures]
+    patches: Mapping[str, Sequence[PatchFigures]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperSummary(RunSummary):
+    """What `recon paper` found, by number of the experiment."""
+
+    as_printed: bool
+    table_1: Sequence[Mapping[str, Any]]
+    experiments: Mapping[str, ExperimentFigures]
+
+    def rows(self) -> Rows:
+        methods = dict.fromkeys(name for one in self.experiments.values() for name in one.methods)
+        corrected = [
+            (one.scene, f"{found.text}")
+            for one in self.experiments.values()
+            if (found := one.methods.get(CORRECTED)) is not None
+        ]
+        return [
+            (f"{counted(len(self.experiments), 'experiment')} by {', '.join(methods)}",),
+            *self.folder_row(),
+            *corrected[:3],
+            *self.cost_row(),
+            ("next", self.open_report()),
+        ]
+
+
 @dataclass(frozen=True, eq=False)
 class MethodResult:
     """Result of one method on one experiment."""
@@ -97,7 +177,7 @@ class MethodResult:
     disparity: Disparity
     depth_m: Float32  # (H, W), metres; NaN = unknown
     cloud: PointCloud  # in camera axes
-    figures: dict[str, Any]  # shares, and errors of disparity and depth; None without ground truth
+    figures: MethodFigures
 
 
 @dataclass(frozen=True)
@@ -184,7 +264,8 @@ def table_1_row(experiment: Experiment) -> dict[str, Any]:
     camera, truth, error = experiment.camera, experiment.truth, None
     if truth is not None and camera.doffs_px > 0:
         depth_m = depth_from_disparity(truth.values, camera_of_table_1(camera))
-        error = (compare_depth(depth_m, truth, camera) or {}).get("median_error_percent")
+        compared = compare_depth(depth_m, truth, camera)
+        error = None if compared is None else compared.median_error_percent
     both = {"baseline_mm": round(1000 * camera.baseline_m, 6), "ndisp": camera.ndisp}
     doffs_px = round(camera.doffs_px, 6)
     return {
@@ -215,19 +296,19 @@ def apply_method(
         cloud = back_project(disparity, pair, _EVERY_POINT, normals=False)
     depth_m, truth = depth_from_disparity(disparity.values, pair.camera), experiment.truth
     known_m = depth_m[np.isfinite(depth_m)]
-    figures = {
-        "valid_percent": 100.0 * float(disparity.valid.mean()),
-        "points": len(cloud),
-        "depth_median_m": float(np.median(known_m)) if len(known_m) else None,
-        "disparity": None if truth is None else to_json(evaluate_disparity(disparity, truth)),
-        "depth": None if truth is None else compare_depth(depth_m, truth, experiment.camera),
-    }
+    figures = MethodFigures(
+        valid_percent=100.0 * float(disparity.valid.mean()),
+        points=len(cloud),
+        depth_median_m=float(np.median(known_m)) if len(known_m) else None,
+        disparity=None if truth is None else evaluate_disparity(disparity, truth),
+        depth=None if truth is None else compare_depth(depth_m, truth, experiment.camera),
+    )
     return MethodResult(method, pair, disparity, depth_m, cloud, figures)
 
 
 def try_patches(
     method: str, experiment: Experiment, config: PaperConfig, threads: int | None = None
-) -> list[dict[str, Any]]:
+) -> list[PatchFigures]:
     """Run a method with each patch size in the settings; ``corrected`` uses the matcher `sad`."""
     if method == CORRECTED:
         pair = Rectifier(experiment.camera, config.rectification).rectify(experiment.pair)
@@ -240,37 +321,40 @@ def try_patches(
             if method == CORRECTED:
                 own = {**config.matching.sad.model_dump(), "window_px": patch_px}
                 matcher = SadMatcher(SadSettings.parse(own), threads)
-            found, truth = matcher.match(pair), experiment.truth
-            bad = right = error = None
-            if truth is not None:
-                metrics = evaluate_disparity(found, truth, (BAD_PX,))
-                bad, error = metrics.bad[BAD_PX], metrics.avgerr_px
-                right = 100 - bad - metrics.invalid
-            valid = {"patch_px": patch_px, "valid_percent": 100 * float(found.valid.mean())}
-            judged = {"bad_percent": bad, "right_percent": right, "avgerr_px": error}
-            figures.append(dict(to_json({**valid, **judged})))
+            figures.append(_patch_figures(patch_px, matcher.match(pair), experiment.truth))
     return figures
 
 
 def compare_depth(
     depth_m: Float32, truth: DisparityTruth, camera: RectifiedCamera
-) -> dict[str, float] | None:
+) -> DepthFigures | None:
     """Compare depths (H, W) with the truth at pixels seen by both cameras; None = none has both."""
     true_m = depth_from_disparity(truth.values, camera)
     both = np.isfinite(depth_m) & np.isfinite(true_m) & truth.nonocc
     if not both.any():
         return None
     found, true = depth_m[both].astype(np.float64), true_m[both].astype(np.float64)
-    return {
-        "median_m": float(np.median(found)),
-        "true_median_m": float(np.median(true)),
-        "median_error_percent": 100 * float(np.median(np.abs(found - true) / true)),
-        "median_ratio": float(np.median(found / true)),
-        "pixels": int(both.sum()),
-    }
+    return DepthFigures(
+        median_m=float(np.median(found)),
+        true_median_m=float(np.median(true)),
+        median_error_percent=100 * float(np.median(np.abs(found - true) / true)),
+        median_ratio=float(np.median(found / true)),
+        pixels=int(both.sum()),
+    )
 
 
 def _printed_pair(experiment: Experiment) -> RectifiedPair:
     pair, rectifier = experiment.pair, Rectifier(experiment.camera)
     left, right = (to_grey(image, "paper") for image in rectifier.warp(pair))
     return replace(rectifier.rectify(pair), left=left, right=right)
+
+
+def _patch_figures(patch_px: int, found: Disparity, truth: DisparityTruth | None) -> PatchFigures:
+    """Return the fractions of pixels with a value, wrong and right, and the mean error in pixels."""
+    bad = right = error = None
+    if truth is not None:
+        metrics = evaluate_disparity(found, truth, (BAD_PX,))
+        bad, error = metrics.bad[BAD_PX], metrics.avgerr_px
+        right = 100 - bad - metrics.invalid
+    valid_percent = 100 * float(found.valid.mean())
+    return PatchFigures(patch_px, valid_percent, bad, right, error)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Bool
 from recon.export.occupancy import GROUND_RATIO, Flattening
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, PointFigures
 from recon.io.models.columns import write_npz, write_pcd
 from recon.io.models.las import write_copc, write_e57, write_las
 from recon.io.models.ply import write_ply_tiles
@@ -27,6 +28,13 @@ _GROWTH: Final = 1.25
 _MUCH: Final = 0.02  # fraction of the points left out without a word; a busy street has less
 
 
+@dataclass(frozen=True)
+class CloudFigures(PointFigures):
+    """The fused cloud, without what moved."""
+
+    points_removed: int
+
+
 def cloud_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the fused cloud, and ``removed.ply`` beside it with what moved."""
     return export_cloud(context.placed.tiles, path, path.with_name("removed.ply"))
@@ -35,7 +43,7 @@ def cloud_product(context: ExportContext, path: Path) -> ExportResult:
 def pcd_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the fused cloud for PCL."""
     clouds = (tile.cloud for tile in context.placed.tiles)
-    return ExportResult({"points": write_pcd(path, clouds)})
+    return ExportResult(PointFigures(write_pcd(path, clouds)))
 
 
 def arrays_product(context: ExportContext, path: Path) -> ExportResult:
@@ -57,7 +65,7 @@ def arrays_product(context: ExportContext, path: Path) -> ExportResult:
         (tile.cloud.arrays for tile in context.placed.tiles if len(tile.cloud)),
         {name: np.concatenate(each) for name, each in whole.items()},
     )
-    return ExportResult({"points": points})
+    return ExportResult(PointFigures(points))
 
 
 def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> ExportResult:
@@ -71,8 +79,9 @@ def export_cloud(tiles: Tiles, path: Path, removed: Path | None = None) -> Expor
     if removed is not None and tiles.config.fusion.remove_moving:
         moved = (tile.removed for tile in tiles)
         left_out = write_ply_tiles(removed, moved, frame="map")
-    figures = {"points": points, "points_removed": left_out}
-    return ExportResult(figures, _doubts(tiles, points, left_out), sample.cloud())
+    return ExportResult(
+        CloudFigures(points, left_out), _doubts(tiles, points, left_out), sample.cloud()
+    )
 
 
 def even_sample(tiles: Tiles) -> PointCloud:
@@ -149,7 +158,7 @@ def las_product(
         return np.zeros(len(cloud), np.bool_) if surface is None else ground_points(cloud, surface)
 
     how = {"step_m": step_m, "ground": are_ground}
-    return ExportResult({"points": write(path, clouds, context.T_survey_map, context.crs, **how)})
+    return ExportResult(PointFigures(write(path, clouds, context.T_survey_map, context.crs, **how)))
 
 
 def copc_product(context: ExportContext, path: Path) -> ExportResult:
@@ -160,7 +169,7 @@ def copc_product(context: ExportContext, path: Path) -> ExportResult:
 def e57_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the cloud as E57, perhaps where a survey says."""
     clouds = (tile.cloud for tile in context.placed.tiles)
-    return ExportResult({"points": write_e57(path, clouds, context.T_survey_map, context.crs)})
+    return ExportResult(PointFigures(write_e57(path, clouds, context.T_survey_map, context.crs)))
 
 
 def ground_points(cloud: PointCloud, surface: GroundSurface) -> Bool:

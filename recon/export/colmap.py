@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,20 @@ import numpy as np
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.camera import project
-from recon.export.product import DriveImages, ExportContext, ExportResult
+from recon.export.product import DriveImages, ExportContext, ExportResult, ProductFigures
 from recon.io.images.image import write_image
 from recon.io.models.colmap import ColmapModel, Seen, write_colmap
 from recon.places.adjustment import shared_points
 from recon.places.closure import Closure, DrivePath
 from recon.sources.source import check_source
+
+
+@dataclass(frozen=True)
+class ColmapFigures(ProductFigures):
+    """A COLMAP model."""
+
+    colmap_images: int
+    colmap_points: int
 
 
 def colmap_product(context: ExportContext, folder: Path) -> ExportResult:
@@ -35,7 +44,7 @@ def colmap_product(context: ExportContext, folder: Path) -> ExportResult:
                     images += 1
             points += written.add_points()
     warnings = [] if points else ["no points in the COLMAP model: no keyframes share any"]
-    return ExportResult({"colmap_images": images, "colmap_points": points}, warnings)
+    return ExportResult(ColmapFigures(images, points), warnings)
 
 
 class _Written:

@@ -20,7 +20,7 @@ from recon.core.values.camera import project, unproject
 from recon.export.product import DriveImages, open_images
 from recon.io.models.las import check_inside
 from recon.map.map import Map
-from recon.map.sessions.georeference import Georeference, edge_m, georeference
+from recon.map.sessions.georeference import ControlFigures, Georeference, edge_m, georeference
 from recon.map.sessions.measured import LEVEL_RAD, Survey, fixed_turn, span_m
 from recon.map.sessions.placed import settings_of
 from recon.stereo.frame import FrameReconstructor
@@ -83,9 +83,17 @@ def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | Non
     for n in np.flatnonzero(used & ~agree):
         apart = f"{metres(float(np.linalg.norm(off_m[n])))} off"
         lines.append(f"control point {points[n].name} contradicts the others: {apart}, left out")
-    columns = [*off_m.T.tolist(), sigma_m.tolist(), agree.tolist(), (~used).tolist()]
-    names = ("east_m", "north_m", "up_m", "sigma_m", "used", "check")
-    rows = (dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True))
+    compared = {
+        point.name: ControlFigures(
+            east_m=float(off_m[n, 0]),
+            north_m=float(off_m[n, 1]),
+            up_m=float(off_m[n, 2]),
+            sigma_m=float(sigma_m[n]),
+            used=bool(agree[n]),
+            check=not used[n],
+        )
+        for n, point in enumerate(points)
+    }
     return Georeference(
         T,
         control.system,
@@ -96,7 +104,7 @@ def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | Non
         tuple(lines),
         turn,
         edge_m(map_, T, turn, place_m[agree]),
-        dict(zip((point.name for point in points), rows, strict=True)),
+        compared,
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from recon.core.values.arrays import Float64, Int32
 from recon.export.occupancy import Flattening
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.export.rasters import ground_slopes
 from recon.io.models.rasters import write_nav2_costs
 from recon.io.models.ros_bag import Message, header, pose, write_bag
@@ -21,13 +23,26 @@ from recon.map.map import Map
 from recon.map.sessions.placed import PlacedMap
 
 
+@dataclass(frozen=True)
+class CostmapFigures(ProductFigures):
+    """How many cells of a costmap are of each kind."""
+
+    costmap_free_cells: int
+    costmap_lethal_cells: int
+    costmap_unseen_cells: int
+    costmap_uncertain_cells: int
+
+    @property
+    def text(self) -> str:
+        return f"{self.costmap_free_cells:,} cells free, {self.costmap_lethal_cells:,} lethal"
+
+
 def costmap_product(context: ExportContext, path: Path) -> ExportResult:
     """Write costs in Nav2's mode ``scale``, given the path of their YAML file."""
     grid, warnings = make_costmap(context.map, context.placed)
     write_nav2_costs(path.with_suffix(""), grid)
-    named = {"free": FREE, "lethal": OCCUPIED, "unseen": UNKNOWN, "uncertain": UNSURE}
-    figures = {f"costmap_{name}_cells": int((grid.cells == v).sum()) for name, v in named.items()}
-    return ExportResult(figures, warnings, grid)
+    counts = (int((grid.cells == value).sum()) for value in (FREE, OCCUPIED, UNKNOWN, UNSURE))
+    return ExportResult(CostmapFigures(*counts), warnings, grid)
 
 
 def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str, ...]]:
@@ -90,6 +105,17 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
     return grid, warnings
 
 
+@dataclass(frozen=True)
+class GridMapFigures(ProductFigures):
+    """A grid map."""
+
+    gridmap_layers: Sequence[str]
+
+    @property
+    def text(self) -> str:
+        return ", ".join(self.gridmap_layers)
+
+
 def gridmap_product(context: ExportContext, folder: Path) -> ExportResult:
     """Write a folder with a bag of one message: height and slope of the ground, and cells.
 
@@ -119,7 +145,7 @@ def gridmap_product(context: ExportContext, folder: Path) -> ExportResult:
     time_ns = round(1e9 * float(context.map.first.trajectory.timestamps_s[0]))
     with write_bag(folder) as bag:
         bag.write("/grid_map", time_ns, _message(time_ns, flat, layers), kept=True)
-    return ExportResult({"gridmap_layers": [*layers]}, warnings)
+    return ExportResult(GridMapFigures([*layers]), warnings)
 
 
 def _known(grid: OccupancyGrid) -> Float64:

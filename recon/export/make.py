@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final, cast
+from typing import Final, TypeVar, cast
 
 from recon.core.errors import MappingError, MeshingError, OutputError, SettingsError
 from recon.core.progress import stage
@@ -26,8 +26,8 @@ from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
 from recon.export.mesh.texture import texture_product
 from recon.export.nerfstudio import nerfstudio_product
-from recon.export.occupancy import grid_product, octomap_product
-from recon.export.product import ExportContext, ExportResult, Product
+from recon.export.occupancy import GridFigures, grid_product, octomap_product
+from recon.export.product import ExportContext, ExportResult, Product, ProductFigures
 from recon.export.rasters import RASTERS, raster_product, stem_of
 from recon.io.atomic import check_targets, writing_to
 from recon.io.models.mesh import MESH_SUFFIXES
@@ -64,6 +64,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
 FORMER_PRODUCTS: Final = {"occupancy": "grid-geotiff"}  # before 1.0
 USUAL: Final = ("cloud", "octomap", "grid", "mesh")  # unless something else is asked for
 OF_A_PAIR: Final = ("cloud", "mesh")
+F = TypeVar("F", bound=ProductFigures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +75,13 @@ class Products:
     warnings: tuple[str, ...]
 
     @property
-    def figures(self) -> dict[str, Any]:
-        return {name: value for one in self.made.values() for name, value in one.figures.items()}
+    def figures(self) -> Mapping[str, ProductFigures]:
+        """The figures of each."""
+        return {name: one.figures for name, one in self.made.items()}
+
+    def figures_of(self, kind: type[F]) -> F:
+        """Return the figures of the product that has such ones."""
+        return next(one for one in self.figures.values() if isinstance(one, kind))
 
     @property
     def cloud(self) -> PointCloud:
@@ -90,7 +96,7 @@ class Products:
     @property
     def camera_height_m(self) -> float | None:
         """Height of the camera above the ground; None = unknown, or not steady."""
-        return cast("float | None", self.made["grid"].figures["camera_height_m"])
+        return self.figures_of(GridFigures).camera_height_m
 
     @property
     def mesh(self) -> TriangleMesh | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +15,7 @@ from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64, UInt8
 from recon.export.cloud import even_sample
 from recon.export.occupancy import Flattening
-from recon.export.product import DriveImages, ExportContext, ExportResult
+from recon.export.product import DriveImages, ExportContext, ExportResult, ProductFigures
 from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
 from recon.io.models.ros_bag import Message, RosBag, header, points, pose, write_bag
@@ -24,6 +25,13 @@ from recon.places.closure import USUAL, DrivePath
 from recon.places.places import spread_over
 
 _LAYOUT: Final = Path(__file__).with_name("foxglove.json")
+
+
+@dataclass(frozen=True)
+class BagFigures(ProductFigures):
+    """A bag."""
+
+    bag_frames: int
 
 
 def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
@@ -56,7 +64,7 @@ def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
                 frames += 1
     layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/", drives[0].name)
     write_text(folder / "foxglove.json", layout)
-    return ExportResult({"bag_frames": frames}, warnings)
+    return ExportResult(BagFigures(frames), warnings)
 
 
 def _transforms(time_ns: int, edges: Sequence[tuple[str, str, Float64]]) -> Message:

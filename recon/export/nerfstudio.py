@@ -6,6 +6,7 @@ Ref: https://docs.nerf.studio/quickstart/data_conventions.html.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +21,7 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Int64
 from recon.core.values.camera import project
 from recon.export.cloud import even_sample
-from recon.export.product import DriveImages, ExportContext, ExportResult
+from recon.export.product import DriveImages, ExportContext, ExportResult, ProductFigures
 from recon.io.fields import write_json
 from recon.io.images.image import write_image
 from recon.io.models.colmap import PIXEL_CENTRE
@@ -32,6 +33,13 @@ _OPENGL: Final = np.diag([1.0, -1.0, -1.0, 1.0])  # x right, y up, looking along
 _FARTHEST_M: Final = 65.535  # in 16 bits of millimetres
 _NAMES: Final = {"images": "file_path", "depths": "depth_file_path", "masks": "mask_path"}
 _POINTS: Final = "sparse_pc.ply"
+
+
+@dataclass(frozen=True)
+class NerfstudioFigures(ProductFigures):
+    """A data set for nerfstudio."""
+
+    nerfstudio_frames: int
 
 
 def nerfstudio_product(context: ExportContext, folder: Path) -> ExportResult:
@@ -65,7 +73,7 @@ def nerfstudio_product(context: ExportContext, folder: Path) -> ExportResult:
         "frames": frames,
     }
     write_json(folder / "transforms.json", content)
-    return ExportResult({"nerfstudio_frames": len(frames)})
+    return ExportResult(NerfstudioFigures(len(frames)))
 
 
 def _intrinsics(camera: RectifiedCamera) -> dict[str, float]:

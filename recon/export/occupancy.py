@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Final
@@ -17,7 +18,7 @@ from recon.core.text import metres
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64, Int32
 from recon.core.values.grid import log_odds
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.io.models.octomap import write_octomap_tiles
 from recon.io.models.rasters import write_nav2
 from recon.map.builders import MIN_PROBABILITY
@@ -54,20 +55,45 @@ MadeGrid = tuple[OccupancyGrid, float | None, tuple[str, ...]]
 at one height), and what a user of the grid should know."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GridFigures(ProductFigures):
+    """The flat grid, and where the camera is above the ground."""
+
+    resolution_m: float
+    rows: int
+    columns: int
+    occupied_cells: int
+    free_cells: int
+    camera_height_m: float | None  # None = unknown, or not at one height
+    T_base_camera: Float64  # (4, 4)
+
+    @property
+    def text(self) -> str:
+        sides = (metres(cells * self.resolution_m) for cells in (self.columns, self.rows))
+        return f"{' × '.join(sides)}, cells of {self.resolution_m:g} m"
+
+
+@dataclass(frozen=True)
+class OctomapFigures(ProductFigures):
+    """The voxels that were observed, undecided ones included."""
+
+    voxels: int
+
+
 def grid_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the flat grid as Nav2 reads it, given the path of its YAML file."""
     grid, height_m, warnings = Flattening(context.placed).grid()
     write_nav2(path.with_suffix(""), grid)
     rows, columns = grid.cells.shape
-    figures = {
-        "resolution_m": grid.resolution_m,
-        "rows": rows,
-        "columns": columns,
-        "occupied_cells": int((grid.cells == OCCUPIED).sum()),
-        "free_cells": int((grid.cells == FREE).sum()),
-        "camera_height_m": height_m,
-        "T_base_camera": base_axes(context.map.first.T_map_world, height_m).tolist(),
-    }
+    figures = GridFigures(
+        resolution_m=grid.resolution_m,
+        rows=rows,
+        columns=columns,
+        occupied_cells=int((grid.cells == OCCUPIED).sum()),
+        free_cells=int((grid.cells == FREE).sum()),
+        camera_height_m=height_m,
+        T_base_camera=base_axes(context.map.first.T_map_world, height_m),
+    )
     return ExportResult(figures, warnings, grid)
 
 
@@ -245,7 +271,7 @@ def _paste(
 def octomap_product(context: ExportContext, path: Path) -> ExportResult:
     """Write OctoMaps ``.bt`` and ``.ot`` with the voxels that are occupied or free.
 
-    The figure is the number of observed voxels, undecided ones included. A map may be too large.
+    A map may be too large.
     """
     tiles, stem, warnings = context.placed.tiles, path.with_suffix(""), []
     known = (drop_undecided(tile.voxels) for tile in tiles)
@@ -253,4 +279,4 @@ def octomap_product(context: ExportContext, path: Path) -> ExportResult:
         write_octomap_tiles(stem, known, tiles.edge_cells.bit_length() - 1, tiles.resolution_m)
     except MappingError as error:
         warnings.append(f"no OctoMap: {error}")
-    return ExportResult({"voxels": sum(len(tile.voxels) for tile in tiles)}, warnings)
+    return ExportResult(OctomapFigures(sum(len(tile.voxels) for tile in tiles)), warnings)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from recon.io.images.image import read_image, write_image
 from recon.io.models.mesh import Photo, write_mesh, write_mlp
 from recon.io.models.ply import write_ply
 from recon.stereo.frame import ReconstructedFrame
+
+pass
+from recon.export.mesh.pieces import MeshFigures
 
 PAIR_CLOUD: Final = "clouds/cloud.ply"
 _PHOTO: Final = "left.png"  # the left image, beside the mesh
@@ -122,7 +125,7 @@ def write_surface(
 
 def mesh_cloud(
     cloud: PointCloud, camera: RectifiedCamera | None, settings: MeshSettings, run: Path
-) -> tuple[TriangleMesh, dict[str, Any]]:
+) -> tuple[TriangleMesh, MeshFigures]:
     """Mesh a cloud in one piece, as its camera saw it if it is that of a pair; with figures.
 
     ``run`` is the folder of the pair, in which its left image may be.
@@ -131,7 +134,7 @@ def mesh_cloud(
         what, hint = "only the surface of a pair is closed behind", "name the folder of its run"
         raise MeshingError(what, got=f"mesh.pair_solid_m={settings.pair_solid_m:g}", hint=hint)
     if camera is None:
-        mesh, covered = reconstruct_mesh(cloud, settings), {}
+        mesh, coverage = reconstruct_mesh(cloud, settings), None
     else:
         photo, path = None, run / "mesh" / _PHOTO
         if path.is_file():  # else the run of the pair made no mesh
@@ -142,10 +145,13 @@ def mesh_cloud(
                 raise FormatError(what, where=path, got=got, expected=expected)
             photo = in_colour(photo)
         mesh = _surface(cloud, camera, settings, photo)
-        covered = {"mesh_coverage": _coverage(mesh, cloud, settings)}
-    sizes = {"points": len(cloud), "vertices": len(mesh.vertices), "faces": len(mesh.faces)}
-    warnings = [line for ratio in covered.values() for line in check_coverage(ratio)]
-    return mesh, {**sizes, **covered, "warnings": warnings}
+        coverage = _coverage(mesh, cloud, settings)
+    return mesh, MeshFigures(
+        points=len(cloud),
+        vertices=len(mesh.vertices),
+        faces=len(mesh.faces),
+        mesh_coverage=coverage,
+    )
 
 
 # A point is covered if the mesh is no farther from it than this fraction of its depth.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -12,6 +12,7 @@ import numpy as np
 
 from recon.core.errors import OutputError, ReconError, SourceError
 from recon.core.progress import tracked
+from recon.core.summary import Figures
 from recon.core.values import Recorded, Rig, StereoPair
 from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.export.mesh.poisson import MeshSettings
@@ -26,6 +27,8 @@ from recon.sources.source import StereoSource, mark_of
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.rectify.rectifier import Rectifier, turns_of
 from recon.street.settings import StreetSettings
+
+pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +60,30 @@ class ExportContext:
         return None if self.survey is None else self.survey.system
 
 
+@dataclass(frozen=True)
+class ProductFigures(Figures):
+    """Base of what is counted and measured of a product."""
+
+    @property
+    def text(self) -> str:
+        """The most important ones in a few words: what is counted, by the last word of its name."""
+        counts = ((one.name, getattr(self, one.name)) for one in fields(self))
+        known = [(name.rpartition("_")[2], n) for name, n in counts if isinstance(n, int) and n]
+        return ", ".join(f"{n:,} {word}" for word, n in known)
+
+
+@dataclass(frozen=True)
+class PointFigures(ProductFigures):
+    """A cloud."""
+
+    points: int
+
+
 @dataclass(frozen=True, eq=False)
 class ExportResult:
-    """What is left of a written product: figures of the summary, warnings, what a report shows."""
+    """What is left of a written product: its figures, warnings, what a report shows."""
 
-    figures: dict[str, Any]
+    figures: ProductFigures
     warnings: Sequence[str] = ()
     value: Any = field(default=None, repr=False)
 

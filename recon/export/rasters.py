@@ -5,7 +5,8 @@ North is up: the map is turned as the survey is, and what each tile has is writt
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -15,10 +16,11 @@ import numpy as np
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, invert
+from recon.core.summary import inline
 from recon.core.values import UNKNOWN, PointCloud
 from recon.core.values.arrays import Bool, Float64, Int64
 from recon.export.occupancy import Flattening
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.io.models.rasters import RasterFile, RasterPlace, write_geotiff
 from recon.map.ground.surface import GroundSurface
 
@@ -32,6 +34,17 @@ def stem_of(name: str) -> str:
     return name.removesuffix("-geotiff")
 
 
+@dataclass(frozen=True)
+class RasterFigures(ProductFigures):
+    """The size of a raster."""
+
+    size: Mapping[str, tuple[int, int]] = inline()  # columns and rows, by its key
+
+    @property
+    def text(self) -> str:
+        return ", ".join(f"{columns} × {rows} cells" for columns, rows in self.size.values())
+
+
 def raster_product(name: str) -> Callable[[ExportContext, Path], ExportResult]:
     """Return what writes one of `RASTERS`, perhaps in survey coordinates."""
     fill, colours = RASTERS[name]
@@ -41,7 +54,8 @@ def raster_product(name: str) -> Callable[[ExportContext, Path], ExportResult]:
         place = _place(context, T_file_map)
         with write_geotiff(path, place, colours=colours, crs=context.crs) as file:
             fill(context, file, T_file_map)
-        return ExportResult({f"{stem_of(name)}_size": [place.columns, place.rows]})
+        size = (place.columns, place.rows)
+        return ExportResult(RasterFigures({f"{stem_of(name)}_size": size}))
 
     return write
 

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from recon.core.errors import RegistrationError, SettingsError
+from recon.core.summary import Figures
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
@@ -33,6 +34,16 @@ _SETTING: Final = "source.length"
 
 KnownLength = tuple[int, int, float]
 """Two frames of a drive, and how far apart the left camera was in them, metres."""
+
+
+@dataclass(frozen=True)
+class BaselineFigures(Figures):
+    """By how much the cameras are farther apart than given, per cent of the baseline."""
+
+    percent: float  # what is corrected
+    sigma_percent: float  # standard deviation of what is left
+    measured_percent: float  # by how much the lengths are longer than the images alone say
+    measured_sigma_percent: float
 
 
 @dataclass(frozen=True)
@@ -59,11 +70,9 @@ class SeenBaseline:
         use = f"used is one {100.0 * self.ratio:+.2f} %" if used else "used is that given"
         return f"measured lengths are {off} off those by the baseline as calibrated; {use}"
 
-    def figures(self) -> dict[str, float]:
-        """Return the same for ``summary.json``, in per cent of the baseline."""
-        ratios = {"percent": self.ratio, "sigma_percent": self.sigma}
-        ratios |= {"measured_percent": self.longer, "measured_sigma_percent": self.longer_sigma}
-        return {name: 100.0 * ratio for name, ratio in ratios.items()}
+    def figures(self) -> BaselineFigures:
+        ratios = (self.ratio, self.sigma, self.longer, self.longer_sigma)
+        return BaselineFigures(*(100.0 * ratio for ratio in ratios))
 
 
 def check_length(source: StereoSource, known: KnownLength) -> None:

@@ -10,21 +10,22 @@ ECMR 2021.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from recon.core.geometry.se3 import make_transform
 from recon.core.progress import stage
-from recon.core.text import metres, to_json
+from recon.core.summary import Figures, inline, optional
+from recon.core.text import metres
 from recon.core.values import RectifiedCamera, Rig, Trajectory
 from recon.core.values.arrays import Float64
 from recon.look.fault import NAMES, TURN, RigFault, active, spread_pixels, without_fault
 from recon.look.fit import FittedFault, fit_fault
 from recon.look.geometry import Rigidity
-from recon.look.length import SeenBaseline
+from recon.look.length import BaselineFigures, SeenBaseline
 from recon.look.tracks import FRAMES, StereoTracks
 from recon.odometry.settings import RigSettings
 from recon.sources.source import StereoSource
@@ -75,6 +76,69 @@ class RigChange:
     def moved_px(self) -> float:
         """By how far features of the right image move against the left one, root mean square."""
         return float(np.hypot(self.rms_px, self.epipolar_rms_px))
+
+
+@dataclass(frozen=True)
+class Measured(Figures):
+    """A value and its standard deviation."""
+
+    mean: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class ImageError(Figures):
+    """An error over an image, in pixels: its mean with a standard deviation, and its rms."""
+
+    mean: float
+    sigma: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class Delay(Figures):
+    """By how much right images are taken later than left ones."""
+
+    frames: float
+    sigma: float  # in frames
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Parameter(Figures):
+    """A parameter of a rig, in radians or as a fraction, with standard deviations."""
+
+    prior: float
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionFigures(Figures):
+    """How a rig differs from its calibration, as the motion of a drive shows it."""
+
+    begun_with: str | None  # which drive of the map it begins with; None = the calibration
+    windows: int
+    fixed: bool
+    pitch_deg: float  # of the right camera, as are the next
+    yaw_deg: float
+    roll_deg: float
+    focal_percent: float
+    disparity_px: ImageError
+    epipolar_error_px: float  # epipolar error, root mean square over the image
+    right_time_offset: Delay
+    depth_percent: Mapping[str, Measured]  # by depth in metres; infinite = behind infinity
+    parameters: Mapping[str, Parameter]
+    not_visible: str = "baseline"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigFigures(Figures):
+    """The rig of a drive: whether it was refined, and what the drive shows of it."""
+
+    refined: bool
+    motion: MotionFigures | None = inline(None)
+    baseline: BaselineFigures | None = optional()  # where lengths were measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,47 +253,38 @@ class RefinedRig:
         known = np.isfinite(self.period_s)
         return frames + (f" ({1e3 * self.period_s * fitted.time_offset:+.0f} ms)" if known else "")
 
-    def figures(self) -> dict[str, Any]:
-        """Return what differs, ready for ``summary.json``; parameters in radians and shares.
-
-        A depth error that is None is infinite.
-        """
-        lengths = {} if self.baseline is None else {"baseline": self.baseline.figures()}
+    def figures(self) -> RigFigures:
+        """Return what differs."""
+        baseline = None if self.baseline is None else self.baseline.figures()
         if self.fitted is None:
-            return {"refined": self.refined, **lengths}
-        values, sigmas = self.fitted.values, np.sqrt(np.diag(self.fitted.covariance))
+            return RigFigures(refined=self.refined, baseline=baseline)
+        fitted, last = self.fitted, self.changes[-1]
+        values, sigmas = fitted.values, np.sqrt(np.diag(fitted.covariance))
+        turned = dict(zip(TURN, np.degrees(values).tolist(), strict=False))
         rows = zip(NAMES, values, sigmas, RigFault(self.camera).sigmas, strict=True)
-        percent = [self.depth_percent(change) for change in self.changes]
-        figures = {
-            "refined": self.refined,
-            "begun_with": self.begun_with,
-            "windows": self.fitted.windows,
-            "fixed": self.fitted.fixed,
-            **{f"{n}_deg": float(np.degrees(x)) for n, x in zip(TURN[:3], values, strict=False)},
-            "focal_percent": -100.0 * float(values[3]),
-            "disparity_px": {
-                "mean": self.changes[-1].mean_px,
-                "sigma": self.sigma_px,
-                "rms": self.changes[-1].rms_px,
+        motion = MotionFigures(
+            begun_with=self.begun_with,
+            windows=fitted.windows,
+            fixed=fitted.fixed,
+            pitch_deg=turned["pitch"],
+            yaw_deg=turned["yaw"],
+            roll_deg=turned["roll"],
+            focal_percent=-100.0 * float(values[3]),
+            disparity_px=ImageError(last.mean_px, self.sigma_px, last.rms_px),
+            epipolar_error_px=last.epipolar_rms_px,
+            right_time_offset=Delay(
+                fitted.time_offset, fitted.time_offset_sigma, self.period_s * fitted.time_offset
+            ),
+            depth_percent={
+                f"{change.depth_m:g}": Measured(*self.depth_percent(change))
+                for change in self.changes
             },
-            "epipolar_error_px": self.changes[-1].epipolar_rms_px,
-            "right_time_offset": {
-                "frames": self.fitted.time_offset,
-                "sigma": self.fitted.time_offset_sigma,
-                "seconds": self.period_s * self.fitted.time_offset,
-            },
-            "depth_percent": {
-                f"{change.depth_m:g}": {"mean": mean, "sigma": sigma}
-                for change, (mean, sigma) in zip(self.changes, percent, strict=True)
-            },
-            "parameters": {
-                name: {"prior": float(prior), "value": float(value), "sigma": float(sigma)}
+            parameters={
+                name: Parameter(float(prior), float(value), float(sigma))
                 for name, value, sigma, prior in rows
             },
-            "not_visible": "baseline",
-            **lengths,
-        }
-        return dict(to_json(figures))
+        )
+        return RigFigures(refined=self.refined, motion=motion, baseline=baseline)
 
     def describe(self, depth_m: float) -> str:
         """Return in words what the drive shows of the rig given, and what it does to a depth."""

@@ -5,14 +5,16 @@ Where it goes is not integrated: the camera goes on as it did, as surely as it d
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from recon.core.geometry.se3 import Motion, hat, make_transform
+from recon.core.summary import Figures
 from recon.core.values import ImuRecord, Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.work import FEW, serial_algebra, side_by_side
@@ -21,6 +23,8 @@ from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualOdometry
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
+
+pass
 
 _MOST_STEPS: Final = 5.0  # usual steps between two samples; over a longer gap nothing is known
 
@@ -98,6 +102,16 @@ def turns_after(vectors: Float64) -> Float64:
     return turns
 
 
+@dataclass(frozen=True, kw_only=True)
+class GuideFigures(Figures):
+    """What is known of an inertial unit, and of how a drive moved."""
+
+    bias_rad_per_s: Sequence[float]
+    bias_sigma_rad_per_s: float
+    noise_deg_per_root_s: float
+    acceleration_m_per_s2: float
+
+
 @dataclass(frozen=True, eq=False)
 class ImuGuide:
     """A gyro whose errors are known, and how steadily the camera moves."""
@@ -131,14 +145,14 @@ class ImuGuide:
             seen.T_world_camera @ make_transform(R, moved_m), covariance, True, self.scale
         )
 
-    def figures(self) -> dict[str, Any]:
-        """Return what is known of the unit and of the motion, for ``summary.json``."""
-        return {
-            "bias_rad_per_s": self.gyro.bias.tolist(),
-            "bias_sigma_rad_per_s": float(np.sqrt(np.diag(self.covariance)[3:6].max())),
-            "noise_deg_per_root_s": float(np.rad2deg(self.noise)),
-            "acceleration_m_per_s2": self.unsteady,
-        }
+    def figures(self) -> GuideFigures:
+        """Return what is known of the unit and of the motion."""
+        return GuideFigures(
+            bias_rad_per_s=self.gyro.bias.tolist(),
+            bias_sigma_rad_per_s=float(np.sqrt(np.diag(self.covariance)[3:6].max())),
+            noise_deg_per_root_s=float(np.rad2deg(self.noise)),
+            acceleration_m_per_s2=self.unsteady,
+        )
 
 
 _UNKNOWN_M: Final = 1e3  # how far off a position is that nothing is known of

@@ -9,19 +9,21 @@ and exteroceptive sensors", ISER 2010.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from recon.core.geometry.se3 import angle_rad, distance_in_sigmas, log_so3
+from recon.core.summary import Figures, inline, named
 from recon.core.text import counted
 from recon.core.values import ImuRecord
 from recon.core.values.arrays import Float64
 from recon.odometry.guide import MAX_SIGMAS
 from recon.odometry.imu import (
+    GuideFigures,
     Gyro,
     ImuGuide,
     ImuSpan,
@@ -52,16 +54,37 @@ _UNEXPLAINED: Final = (
 )
 
 
+@dataclass(frozen=True, kw_only=True)
+class ImuFit(Figures):
+    """What a drive shows of its inertial unit, beside what files state."""
+
+    origin: str = named("from")
+    time_offset_ms: float
+    late_sigma_ms: float
+    axes_off_deg: float | None
+    axes_sigma_deg: float
+    guide: GuideFigures = inline()
+    up_sigma_deg: float  # standard deviation of the vertical; NaN = not found
+
+
+@dataclass(frozen=True)
+class ImuFigures(Figures):
+    """Whether an inertial unit was used, and what the drive shows of it."""
+
+    used: bool
+    found: ImuFit | None = inline(None)
+
+
 @dataclass(frozen=True, eq=False)
 class FittedImu:
     """What the drive shows of its inertial unit."""
 
     guide: ImuGuide | None  # None = it cannot be used
     lines: tuple[str, ...] = ()  # what the user should know of it
-    figures: Mapping[str, Any] = field(default_factory=dict)
+    found: ImuFit | None = None  # None = nothing was fitted
 
-    def summary(self) -> dict[str, Any]:
-        return {"used": self.guide is not None, **self.figures}
+    def figures(self) -> ImuFigures:
+        return ImuFigures(self.guide is not None, self.found)
 
 
 def fit_imu(
@@ -109,8 +132,16 @@ def fit_imu(
     step_m = float(np.median(np.concatenate([run.sigma_m for run in runs])))
     guide = ImuGuide(fit.gyro, fit.covariance, fit.noise, accelerations(fit.gyro), step_m, up)
     lines = (*notes, *(f"IMU: {fault}; used as found" for fault in faults))
-    return FittedImu(guide, lines, {"from": record.origin, **free.figures(T_stated),
-                                    **guide.figures(), "up_sigma_deg": up_deg})  # fmt: skip
+    found = ImuFit(
+        origin=record.origin,
+        time_offset_ms=1e3 * free.gyro.time_offset_s,
+        late_sigma_ms=free.sigma_ms,
+        axes_off_deg=None if T_stated is None else free.axes_off_deg(T_stated),
+        axes_sigma_deg=free.sigma_deg,
+        guide=guide.figures(),
+        up_sigma_deg=up_deg,
+    )
+    return FittedImu(guide, lines, found)
 
 
 def _unused(why: str, got: str, notes: tuple[str, ...]) -> FittedImu:
@@ -170,14 +201,6 @@ class _Fit:
 
     def axes_off_deg(self, T_stated: Float64) -> float:
         return float(np.rad2deg(angle_rad(self.gyro.R_camera_imu @ T_stated[:3, :3].T)))
-
-    def figures(self, T_stated: Float64 | None) -> dict[str, Any]:
-        return {
-            "time_offset_ms": 1e3 * self.gyro.time_offset_s,
-            "late_sigma_ms": self.sigma_ms,
-            "axes_off_deg": None if T_stated is None else self.axes_off_deg(T_stated),
-            "axes_sigma_deg": self.sigma_deg,
-        }
 
 
 def _faults(fit: _Fit, T_stated: Float64 | None) -> list[str]:

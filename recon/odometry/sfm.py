@@ -24,6 +24,7 @@ import numpy as np
 
 from recon.core.errors import RegistrationError, SettingsError, require
 from recon.core.geometry.se3 import apply, invert
+from recon.core.summary import Figures
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, Float64, Int64, UInt8
@@ -314,6 +315,16 @@ class Model:
     reprojection_px: float  # mean error of all features
 
 
+@dataclass(frozen=True)
+class SfmFigures(Figures):
+    """How many pairs structure from motion placed, and how well."""
+
+    pairs: int
+    registered: int  # in the largest model
+    models: Sequence[int]  # pairs in each
+    reprojection_px: float  # mean error in the largest
+
+
 @dataclass(frozen=True, eq=False)
 class FoundPoses:
     """What structure from motion found of the pairs of a source."""
@@ -321,13 +332,9 @@ class FoundPoses:
     pairs: int  # number of pairs of the source
     models: tuple[Model, ...]  # the largest first; no pair is in two of them
 
-    def figures(self) -> dict[str, Any]:
-        return {
-            "pairs": self.pairs,
-            "registered": len(self.models[0].frames),
-            "models": [len(model.frames) for model in self.models],
-            "reprojection_px": self.models[0].reprojection_px,
-        }
+    def figures(self) -> SfmFigures:
+        sizes = [len(model.frames) for model in self.models]
+        return SfmFigures(self.pairs, sizes[0], sizes, self.models[0].reprojection_px)
 
     def warnings(self) -> list[str]:
         """Return what the user should know, the most important first."""

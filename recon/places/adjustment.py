@@ -29,6 +29,7 @@ from scipy.sparse.csgraph import connected_components
 
 from recon.core.geometry.alignment import Problem, minimise
 from recon.core.geometry.se3 import invert
+from recon.core.summary import Figures
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
@@ -69,6 +70,16 @@ class StoredKeyframes(Protocol):
     def get(self, frame: int) -> StoredKeyframe: ...
 
 
+@dataclass(frozen=True)
+class AdjustmentFigures(Figures):
+    """How well a path fits points that were left out, before and after it was adjusted."""
+
+    keyframes: int
+    points: int
+    left_out_before_px: float  # median distance from where they should be
+    left_out_after_px: float
+
+
 @dataclass(frozen=True, eq=False)
 class Adjustment:
     """An adjusted path, and how well it fits points that were left out."""
@@ -79,13 +90,8 @@ class Adjustment:
     before_px: float  # median distance of what was left out from where it should be, before
     after_px: float  # and after
 
-    def figures(self) -> dict[str, float]:
-        return {
-            "keyframes": self.keyframes,
-            "points": self.points,
-            "left_out_before_px": self.before_px,
-            "left_out_after_px": self.after_px,
-        }
+    def figures(self) -> AdjustmentFigures:
+        return AdjustmentFigures(self.keyframes, self.points, self.before_px, self.after_px)
 
 
 def adjust_path(

@@ -32,9 +32,9 @@ def write_audit_page(
     write_page(
         "audit",
         run,
-        audit.summary,
+        audit.summary.to_json(),
         source=source,
-        lines=audit_lines(audit.summary),
+        lines=audit_lines(audit.summary.to_json()),
         rig=rig_content(audit.rig),
         frames=frames_figure(audit.pairs) if audit.pairs else None,
         pairs=[_pair(look, look.shown, matcher) for look in audit.pairs if look.shown is not None],

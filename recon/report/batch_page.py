@@ -57,7 +57,7 @@ def _table(command: str, results: Sequence[JobResult]) -> Table:
         facts, figures = one.facts, (one.figures.get(name, NOT_KNOWN) for name in columns)
         cells = (f"{x:.4g}" if isinstance(x, float) else str(x) for x in figures)
         spent = (f"{one.seconds:.1f}", f"{one.bytes / 1e6:.1f}")
-        shown = (facts["state"], str(facts["tries"]), *spent)
+        shown = (facts.state, str(facts.tries), *spent)
         rows.append((one.job.name, one.last.error or one.remark, *shown, *cells))
     return Table(command, ("job", "remark", "state", "tries", "seconds", "MB", *columns), rows)
 
@@ -70,7 +70,8 @@ def batch_csv(results: Sequence[JobResult]) -> str:
     rows = [
         [found.get(key, "") for found, keys in parts for key in keys]
         for parts in (
-            ((one.facts, facts), (one.job.swept, swept), (one.figures, names)) for one in results
+            ((one.facts.to_json(), facts), (one.job.swept, swept), (one.figures, names))
+            for one in results
         )
     ]
     return csv_text([["job", *facts[1:], *swept, *names], *rows])

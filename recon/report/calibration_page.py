@@ -35,7 +35,7 @@ def write_calibration_page(result: CalibrationResult, run: RunDirectory) -> None
         "depth_error": depth_error_figure(result),
     }
     _write_pictures(figures, run)
-    write_page("calibration", run, result.summary, figures=figures)
+    write_page("calibration", run, result.summary.to_json(), figures=figures)
 
 
 def _epipolar_pictures(result: CalibrationResult) -> dict[str, bytes]:
@@ -58,12 +58,13 @@ def coverage_figure(result: CalibrationResult) -> bytes:
     """Draw all corners found in both images, over the cells of the coverage measure."""
     width, height = result.seen.size_px
     height_in = style.WIDE_IN / 2 * height / width + 0.5
+    figures = result.summary.to_json()
     figure, both = style.subplots(style.WIDE_IN, height_in, columns=2)
     for side, (name, axes) in enumerate(zip(("left", "right"), both, strict=True)):
         colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(result.fit.views)))
         for view, colour in zip(result.fit.views, colours, strict=True):
             axes.plot(*view.seen[side].pixels.T, ".", color=colour, markersize=3.5, alpha=0.8)
-        ratio = result.summary[f"coverage_{name}"]
+        ratio = figures[f"coverage_{name}"]
         axes.set_title(f"{name.capitalize()}: {100 * ratio:.0f} % of the cells")
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
         axes.set_xticks(np.linspace(0, width, _CELLS[0] + 1)[1:-1], [])

@@ -173,7 +173,7 @@ def write_localize_page(result: LocalizeResult, run: RunDirectory) -> None:
         drawn["path"] = figures.grid_figure(result.grid, ways)
     elif len(path):
         drawn["path"] = figures.path_figure(path, None, T_map_world)
-    write_page("localize", run, result.summary, result=result, figures=drawn)
+    write_page("localize", run, result.summary.to_json(), result=result, figures=drawn)
 
 
 @style.styled

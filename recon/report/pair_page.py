@@ -27,6 +27,7 @@ from recon.core.values import (
 from recon.core.values.arrays import Bool, UInt8
 from recon.core.values.camera import depth_from_disparity, disparity_from_depth
 from recon.evaluation.disparity import Kind
+from recon.evaluation.pair_summary import DisparitySummary, PairSummary
 from recon.io.images.image import write_image
 from recon.report import style
 from recon.report.page import write_page
@@ -43,7 +44,7 @@ class PairResult:
     config: StereoSettings  # the configuration
     pair: Rectified  # the rectified images
     disparity: Disparity  # their disparity
-    summary: dict[str, Any]  # the figures of ``summary.json``
+    summary: DisparitySummary | PairSummary
     #: The points in camera axes, or None if only the disparity was requested.
     cloud: PointCloud | None = None
     mesh: TriangleMesh | None = None  # the surface in camera axes, or None
@@ -62,7 +63,7 @@ class PairResult:
 def write_pair_page(result: PairResult, run: RunDirectory) -> None:
     """Write ``report.html`` of a pair, and its results as colour images."""
     write_disparity_images(result, run)
-    write_page("pair", run, result.summary, **pair_content(result))
+    write_page("pair", run, result.summary.to_json(), **pair_content(result))
 
 
 def write_disparity_images(result: PairResult, run: RunDirectory) -> None:

@@ -27,7 +27,7 @@ def rig_content(rig: RefinedRig | None) -> Json | None:
     """Return the field and the tables of a rig; None if it was not fitted."""
     if rig is None or rig.fitted is None:
         return None
-    found = rig.figures()
+    found = rig.figures().to_json()
     return {
         "refined": rig.refined,
         "depth_m": rig.changes[-1].depth_m,

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, Literal
 
 import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError
 from recon.core.progress import stage
-from recon.core.text import to_json
+from recon.core.summary import (
+    Figures,
+    Rows,
+    RunSummary,
+    hidden,
+    inline,
+    optional,
+    shown_path,
+)
+from recon.core.text import counted, metres
 from recon.core.values import Disparity, Reason, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import depth_sigma
 from recon.look.findings import Finding, Verdict, find_faults, verdict_of
 from recon.look.look import Look, look_at
-from recon.look.rig import RefinedRig
+from recon.look.rig import RefinedRig, RigFigures
 from recon.look.sample import QUICK, THOROUGH, PairMeasures
 from recon.look.settings import AuditedSettings
 from recon.rig.written import form_of, nearest_of_kalibr, write_rig
@@ -39,8 +49,119 @@ _FEW_MEASURED_RATIO: Final = 0.25
 _NOT_OF_THE_RIG: Final = frozenset(
     {"lag", "nonrigid", "stabilised", "swapped", "size", "frozen", "unreadable"}
 )
-_TURNED: Final = ("pitch_deg", "yaw_deg", "roll_deg", "focal_percent")
+_SHOWN_AT: Final = "10"  # distance of the depth error that the terminal says
 _LEAST_SIGMA_PX: Final = 0.05  # no matcher is more accurate on real images
+
+
+@dataclass(frozen=True)
+class FindingFigures(Figures):
+    """One fact about a recording that its user should know."""
+
+    code: str  # its kind, one word, for programs
+    severity: Literal["fatal", "warning"]
+    text: str  # description and advice, for people
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditFigures(Figures):
+    """What is measured of a recording; None = it is not known."""
+
+    source: str
+    description: str
+    frames: int
+    frames_left_out: int
+    frames_read: int
+    repeated_frames: int
+    frozen_left_frames: int
+    frozen_right_frames: int
+    gaps: int
+    longest_step_s: float
+    usual_step_s: float
+    gain: float  # brightness of the right images, relative to that of the left ones
+    sharpness_left: float | None  # from 0 to 1
+    sharpness_right: float | None
+    features: int
+    swapped_ratio: float  # fraction of near features that suggest swapped cameras
+    time_offset_frames: int | None  # by how many frames the right camera is late
+    time_skew_frames: float | None
+    baseline_m: float
+    focal_px: float
+    field_of_view_deg: float
+    speed_m_per_s: float
+    epipolar_error_mean_px: float | None = optional()  # epipolar error of features
+    epipolar_error_spread_px: float | None = optional()
+    epipolar_error_rms_px: float | None = optional()
+    epipolar_noise_px: float | None = optional()
+    repair_pitch_deg: float | None = optional()  # rotation of the right camera that corrects it
+    repair_roll_deg: float | None = optional()
+    disparity_5_50_95_px: Sequence[float] | None = optional()
+    depth_error_m: Mapping[str, float] | None = optional()  # standard deviation by distance
+    rig_by_motion: RigFigures | None = optional()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correction(Figures):
+    """How a corrected rig differs from its calibration."""
+
+    epipolar_error_before_px: float
+    pitch_deg: float  # of the right camera, as are the next
+    yaw_deg: float = 0.0
+    roll_deg: float
+    focal_percent: float = 0.0
+    disparity_rms_px: float | None = optional()  # over the image, where motion shows it
+    lens_off_px: float | None = optional()  # of the nearest lens that the format knows
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrectedFigures(Figures):
+    """A corrected rig that was written."""
+
+    correction: Correction = inline()
+    calibration: str
+    files: Sequence[str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AuditSummary(RunSummary):
+    """What `recon audit` found; its warnings are those of the source."""
+
+    verdict: Verdict
+    findings: Sequence[FindingFigures]
+    figures: AuditFigures = inline()
+    repaired: CorrectedFigures | None = optional()
+    path: str = hidden("")  # of the recording, as it was named
+
+    def remarks(self) -> list[tuple[str, str]]:
+        return [*super().remarks(), *((one.severity, one.text) for one in self.findings)]
+
+    def rows(self) -> Rows:
+        found = self.figures
+        frames = f"{counted(found.frames, 'frame')}, {found.frames_read} examined"
+        repeated = f", {found.repeated_frames} repeated" if found.repeated_frames else ""
+        rms_px, depths_m = found.epipolar_error_rms_px, found.depth_error_m or {}
+        off_m = depths_m.get(_SHOWN_AT)
+        return [
+            (f"{found.source} is {self.verdict}",),
+            ("frames", frames + repeated),
+            *([] if rms_px is None else [("epipolar", f"error of {rms_px:.2f} px (RMS)")]),
+            *(
+                []
+                if off_m is None
+                else [("depth", f"± {off_m:.2g} m at {_SHOWN_AT} m (standard deviation)")]
+            ),
+            ("rig", f"baseline {metres(found.baseline_m)}, focal length {found.focal_px:.0f} px"),
+            *([] if self.repaired is None else [("repaired", ", ".join(self.repaired.files))]),
+            *self.folder_row(),
+            self._next(),
+        ]
+
+    def _next(self) -> tuple[str, str]:
+        source = shown_path(self.path) if self.path else "SOURCE"
+        if self.verdict == "not usable":
+            return "next", "repair what is fatal above, or record again"
+        if self.repaired is not None:
+            return "next", f"recon map {source} --calib {shown_path(self.repaired.calibration)}"
+        return "next", f"recon map {source}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,25 +170,30 @@ class Audit:
 
     verdict: Verdict
     findings: tuple[Finding, ...]  # problems, fatal ones first
-    figures: dict[str, Any]  # all measures, ready for JSON
+    figures: AuditFigures  # all measures
+    notes: Sequence[str]  # what the source says of itself
     alignment: EpipolarAlignment | None  # of all pairs together; None = too few features
     rig: RefinedRig  # as given, and as the motion of the drive shows it
     pairs: tuple[PairMeasures, ...] = ()  # what was measured in each, and a few images
-    corrected: dict[str, Any] | None = None  # what `correct_calibration` did, if it was asked to
+    corrected: CorrectedFigures | None = None  # what `correct_calibration` did, if it was asked to
 
     def __repr__(self) -> str:
         found = ", ".join(finding.code for finding in self.findings) or "no findings"
         return f"Audit({self.verdict!r}, {found})"
 
     @property
-    def summary(self) -> dict[str, Any]:
-        """The content of ``--json``."""
-        findings = [
-            {"code": f.code, "severity": "fatal" if f.fatal else "warning", "text": f.text}
-            for f in self.findings
-        ]
-        summary = {"verdict": self.verdict, "findings": findings, **self.figures}
-        return summary if self.corrected is None else {**summary, "repaired": self.corrected}
+    def summary(self) -> AuditSummary:
+        """What `recon audit` prints."""
+        return AuditSummary(
+            verdict=self.verdict,
+            findings=[
+                FindingFigures(one.code, "fatal" if one.fatal else "warning", one.text)
+                for one in self.findings
+            ],
+            warnings=self.notes,
+            figures=self.figures,
+            repaired=self.corrected,
+        )
 
 
 def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool = False) -> Audit:
@@ -78,12 +204,13 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
     findings = find_faults(look, config)
     verdict, seen = verdict_of(findings), tuple(look.sample.pairs)
     alignment, figures = look.geometry.alignment, _figures(look)
-    return Audit(verdict, tuple(findings), figures, alignment, look.rig, seen)
+    notes = look.source.warnings()
+    return Audit(verdict, tuple(findings), figures, notes, alignment, look.rig, seen)
 
 
 def correct_calibration(
     source: StereoSource, config: AuditedSettings, audit: Audit, path: Path
-) -> dict[str, Any]:
+) -> CorrectedFigures:
     """Write the calibration with which rows and motion agree, and return how it differs.
 
     It is the one that `recon map` uses; of a drive that is too short for it, rows alone are
@@ -105,80 +232,91 @@ def correct_calibration(
             where=source.name,
             hint="record scenes with more texture, or recalibrate the cameras",
         )
-    figures = {"epipolar_error_before_px": rows.rms_px}
-    if rig.fitted is None:
-        R_left = turns_of(source.calibration, config.rectification).R_left
+    own, R_left = rig.figures().motion, turns_of(source.calibration, config.rectification).R_left
+    if own is None:
         corrected: Rig = correct_rig(source.calibration, rows.turn, R_left)
         pitch_deg, _, roll_deg, _ = np.degrees(rows.turn).tolist()
-        figures |= {"pitch_deg": pitch_deg, "yaw_deg": 0.0, "roll_deg": roll_deg}
-        figures["focal_percent"] = 0.0
+        found = Correction(
+            epipolar_error_before_px=rows.rms_px, pitch_deg=pitch_deg, roll_deg=roll_deg
+        )
     else:
-        corrected, own = rig.calibration, rig.figures()
-        figures |= {name: own[name] for name in _TURNED}
-        figures["disparity_rms_px"] = own["disparity_px"]["rms"]
+        corrected = rig.calibration
+        found = Correction(
+            epipolar_error_before_px=rows.rms_px,
+            pitch_deg=own.pitch_deg,
+            yaw_deg=own.yaw_deg,
+            roll_deg=own.roll_deg,
+            focal_percent=own.focal_percent,
+            disparity_rms_px=own.disparity_px.rms,
+        )
     if form_of(path) == "kalibr":
-        corrected, figures["lens_off_px"] = nearest_of_kalibr(corrected)
-    files = write_rig(path, corrected, config.rectification, quality=figures)
-    return {**figures, "calibration": str(files[0]), "files": [str(file) for file in files]}
+        corrected, lens_off_px = nearest_of_kalibr(corrected)
+        found = replace(found, lens_off_px=lens_off_px)
+    files = write_rig(path, corrected, config.rectification, quality=found.to_json())
+    names = [str(file) for file in files]
+    return CorrectedFigures(correction=found, calibration=names[0], files=names)
 
 
-def _figures(look: Look) -> dict[str, Any]:
+def _figures(look: Look) -> AuditFigures:
     source, sample, gaps = look.source, look.sample, look.gaps
     geometry, camera, rig = look.geometry, look.camera, look.rig
     sharpness = [None, None] if sample.sharpness is None else sample.sharpness.tolist()
-    return {
-        "source": source.name,
-        "description": source.description,
-        "frames": len(source),
-        "frames_left_out": source.left_out,
-        "warnings": source.warnings(),
-        "frames_read": sample.frames,
-        "repeated_frames": sample.repeats.both,
-        "frozen_left_frames": sample.repeats.frozen[0],
-        "frozen_right_frames": sample.repeats.frozen[1],
-        "gaps": gaps.count,
-        "longest_step_s": to_json(gaps.longest_s),
-        "usual_step_s": to_json(gaps.usual_s),
-        "gain": to_json(sample.gain[0]),
-        "sharpness_left": sharpness[0],
-        "sharpness_right": sharpness[1],
-        "features": len(geometry.features),
-        "swapped_ratio": to_json(geometry.swapped_ratio),
-        "time_offset_frames": geometry.offset,
-        "time_skew_frames": None if look.skew is None else look.skew[0],
-        "baseline_m": camera.baseline_m,
-        "focal_px": camera.focal_px,
-        "field_of_view_deg": camera.field_of_view_deg,
-        "speed_m_per_s": to_json(sample.speed_m_per_s),
-        **_alignment_figures(geometry.alignment, geometry.disparity_px, camera),
-        **({"rig_by_motion": rig.figures()} if rig.fitted else {}),
-    }
+    found = AuditFigures(
+        source=source.name,
+        description=source.description,
+        frames=len(source),
+        frames_left_out=source.left_out,
+        frames_read=sample.frames,
+        repeated_frames=sample.repeats.both,
+        frozen_left_frames=sample.repeats.frozen[0],
+        frozen_right_frames=sample.repeats.frozen[1],
+        gaps=gaps.count,
+        longest_step_s=gaps.longest_s,
+        usual_step_s=gaps.usual_s,
+        gain=sample.gain[0],
+        sharpness_left=sharpness[0],
+        sharpness_right=sharpness[1],
+        features=len(geometry.features),
+        swapped_ratio=geometry.swapped_ratio,
+        time_offset_frames=geometry.offset,
+        time_skew_frames=None if look.skew is None else look.skew[0],
+        baseline_m=camera.baseline_m,
+        focal_px=camera.focal_px,
+        field_of_view_deg=camera.field_of_view_deg,
+        speed_m_per_s=sample.speed_m_per_s,
+        rig_by_motion=rig.figures() if rig.fitted else None,
+    )
+    return _with_alignment(found, geometry.alignment, geometry.disparity_px, camera)
 
 
-def _alignment_figures(
-    alignment: EpipolarAlignment | None, disparity_px: Float64, camera: RectifiedCamera
-) -> dict[str, Any]:
-    """Return epipolar errors, disparities, and the depth error if columns are as accurate as rows."""
+def _with_alignment(
+    found: AuditFigures,
+    alignment: EpipolarAlignment | None,
+    disparity_px: Float64,
+    camera: RectifiedCamera,
+) -> AuditFigures:
+    """Add epipolar errors, disparities, and the depth error if columns are as accurate as rows."""
     if alignment is None:
-        return {}
+        return found
     pitch_deg, _, roll_deg, _ = np.degrees(alignment.turn).tolist()
-    figures = {
-        "epipolar_error_mean_px": alignment.mean_px,
-        "epipolar_error_spread_px": alignment.spread_px,
-        "epipolar_error_rms_px": alignment.rms_px,
-        "epipolar_noise_px": alignment.residual_px,
-        "repair_pitch_deg": pitch_deg,
-        "repair_roll_deg": roll_deg,
-    }
+    found = replace(
+        found,
+        epipolar_error_mean_px=alignment.mean_px,
+        epipolar_error_spread_px=alignment.spread_px,
+        epipolar_error_rms_px=alignment.rms_px,
+        epipolar_noise_px=alignment.residual_px,
+        repair_pitch_deg=pitch_deg,
+        repair_roll_deg=roll_deg,
+    )
     if not len(disparity_px):
-        return figures
+        return found
     sigma_px = np.float32(max(alignment.residual_px, _LEAST_SIGMA_PX))
     errors = depth_sigma(np.array(_RANGES_M, np.float32), sigma_px, camera)
-    return {
-        **figures,
-        "disparity_5_50_95_px": np.quantile(disparity_px, [0.05, 0.5, 0.95]).tolist(),
-        "depth_error_m": {f"{r:g}": float(e) for r, e in zip(_RANGES_M, errors, strict=True)},
-    }
+    return replace(
+        found,
+        disparity_5_50_95_px=np.quantile(disparity_px, [0.05, 0.5, 0.95]).tolist(),
+        depth_error_m={f"{r:g}": float(e) for r, e in zip(_RANGES_M, errors, strict=True)},
+    )
 
 
 def check_related(look: Look, config: StereoSettings) -> None:

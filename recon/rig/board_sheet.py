@@ -15,6 +15,7 @@ from matplotlib.patches import PathPatch, Rectangle
 from matplotlib.path import Path as Outline
 
 from recon.core.errors import OutputError, SettingsError
+from recon.core.summary import Rows, Summary, optional
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
 from recon.io.atomic import write_bytes
@@ -49,9 +50,35 @@ class Sheet:
     height_mm: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class BoardSummary(Summary):
+    """A board that was drawn on a sheet."""
+
+    board: str
+    square_mm: float
+    pattern_width_mm: float
+    pattern_height_mm: float
+    paper: str
+    paper_width_mm: float
+    paper_height_mm: float
+    file: str
+    dpi: float | None = optional()  # of a PNG
+
+    def rows(self) -> Rows:
+        size = f"{self.pattern_width_mm:g} × {self.pattern_height_mm:g} mm"
+        sheet = f"{self.paper_width_mm:g} × {self.paper_height_mm:g} mm"
+        dpi = "" if self.dpi is None else f", {self.dpi:.1f} dpi"
+        return [
+            (f"board {self.board}, {size}, squares of {self.square_mm:g} mm",),
+            ("file", self.file, f"{self.paper}, {sheet}{dpi}"),
+            ("print", "at 100 %, and check the ruler on it"),
+            ("next", f"recon calibrate LEFT RIGHT --board {self.board}"),
+        ]
+
+
 def write_board(
     path: Path, board: CalibrationBoard, paper: str | None = None, dpi: float = 300.0
-) -> dict[str, Any]:
+) -> BoardSummary:
     """Draw a board to scale in the centre of a sheet, with a ruler to check the print.
 
     ``paper`` is the name of a size, or ``600x400mm``; None = the smallest A size that fits. ``dpi``
@@ -84,17 +111,17 @@ def write_board(
         )
     write_bytes(path, _draw(board, sheet, kind[1:], exact_dpi))
     width_mm, height_mm = (1e3 * length for length in board.size_m)
-    figures = {
-        "board": str(board),
-        "square_mm": 1e3 * board.square_m,
-        "pattern_width_mm": width_mm,
-        "pattern_height_mm": height_mm,
-        "paper": sheet.name,
-        "paper_width_mm": sheet.width_mm,
-        "paper_height_mm": sheet.height_mm,
-        "file": str(path),
-    }
-    return figures | ({"dpi": exact_dpi} if kind == ".png" else {})
+    return BoardSummary(
+        board=str(board),
+        square_mm=1e3 * board.square_m,
+        pattern_width_mm=width_mm,
+        pattern_height_mm=height_mm,
+        paper=sheet.name,
+        paper_width_mm=sheet.width_mm,
+        paper_height_mm=sheet.height_mm,
+        file=str(path),
+        dpi=exact_dpi if kind == ".png" else None,
+    )
 
 
 def choose_sheet(board: CalibrationBoard, paper: str | None = None) -> Sheet:

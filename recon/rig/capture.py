@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -23,7 +23,8 @@ from typing_extensions import Self
 
 from recon.core.errors import OutputError, ReconError, SettingsError, SourceError
 from recon.core.settings import Settings
-from recon.core.text import is_count
+from recon.core.summary import Figures, Rows, Summary, inline, shown_path
+from recon.core.text import counted, is_count
 from recon.core.values import Rig, StereoPair
 from recon.core.values.arrays import UInt8, size_text
 from recon.io.images.image import write_image
@@ -163,6 +164,47 @@ def _retrieve(cameras: tuple[Camera, ...], settings: CaptureSettings) -> tuple[U
     return images[0], images[1]
 
 
+@dataclass(frozen=True, kw_only=True)
+class CaptureFigures(Figures):
+    """How many pairs were recorded, and how regularly."""
+
+    frames: int
+    seconds: float  # from the first pair to the last
+    rate_hz: float | None
+    gaps: int
+    skew_mean_ms: float | None  # difference in time between the cameras
+    skew_max_ms: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureSummary(Summary):
+    """What `recon capture` recorded: the content of ``capture.json``."""
+
+    started_utc: str
+    devices: Sequence[str]
+    exposure_locked: bool
+    figures: CaptureFigures = inline()
+    calibration: bool  # whether it lies in the folder
+    out: str
+
+    def rows(self) -> Rows:
+        seen = self.figures
+        rate = (
+            ""
+            if seen.rate_hz is None
+            else f" at {seen.rate_hz:.3g} Hz, {counted(seen.gaps, 'gap')}"
+        )
+        skew = seen.skew_max_ms
+        apart = "" if skew is None else f"left and right at most {skew:.1f} ms apart"
+        calibrated = "" if self.calibration else " --calib CALIBRATION"
+        return [
+            (f"{counted(seen.frames, 'pair')} in {seen.seconds:.1f} s{rate}",),
+            ("folder", self.out),
+            *([("time", apart)] if apart else []),
+            ("next", f"recon audit {shown_path(self.out)}{calibrated}"),
+        ]
+
+
 class CaptureFolder:
     """The folder a capture is written to, pair by pair, each wholly or not at all."""
 
@@ -217,19 +259,18 @@ class CaptureFolder:
         write_image(self.folder / "preview.jpg", np.hstack([pair.left, pair.right]))
 
     @property
-    def figures(self) -> dict[str, Any]:
-        """Number of pairs, rate, gaps and difference in time between the cameras."""
+    def figures(self) -> CaptureFigures:
         left_s, frames = np.array(self._left_s), self.frames
         steps_s, skew_s = np.diff(left_s), np.abs(np.array(self._right_s) - left_s)
         period_s = float(np.median(steps_s)) if frames > 1 else None
-        return {
-            "frames": frames,
-            "seconds": float(left_s[-1] - left_s[0]) if frames else 0.0,
-            "rate_hz": 1 / period_s if period_s else None,
-            "gaps": int((steps_s > _GAP_PERIODS * period_s).sum()) if period_s else 0,
-            "skew_mean_ms": 1000 * float(skew_s.mean()) if frames else None,
-            "skew_max_ms": 1000 * float(skew_s.max()) if frames else None,
-        }
+        return CaptureFigures(
+            frames=frames,
+            seconds=float(left_s[-1] - left_s[0]) if frames else 0.0,
+            rate_hz=1 / period_s if period_s else None,
+            gaps=int((steps_s > _GAP_PERIODS * period_s).sum()) if period_s else 0,
+            skew_mean_ms=1000 * float(skew_s.mean()) if frames else None,
+            skew_max_ms=1000 * float(skew_s.max()) if frames else None,
+        )
 
     def _append(self, line: bytes) -> None:
         try:

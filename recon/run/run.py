@@ -6,16 +6,18 @@ import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
 from datetime import datetime, timezone
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from typing_extensions import Self
 
 from recon.core import progress
 from recon.core.machine import peak_memory_mb, versions
 from recon.core.settings import Settings
+from recon.core.summary import RunSummary
 from recon.core.work import Stopwatch, use_threads
 from recon.io.fields import write_yaml
 from recon.io.files import StrPath, fingerprint, resolved
@@ -23,6 +25,7 @@ from recon.run.directory import RECORD, RunDirectory, default_folder
 
 CONFIG: Final = "config.yaml"
 SUMMARY: Final = "summary.json"
+Summary = TypeVar("Summary", bound=RunSummary)
 
 
 class Run(RunDirectory):
@@ -34,9 +37,9 @@ class Run(RunDirectory):
         with Run("pair", out, config) as run:
             with run.stage("match"):
                 write_pfm(run.path("disparity/disparity.pfm"), match(pair))
-            with run.report(summary):
-                write_pair_page(result, run)
-            run.finish(summary, source="im0.png", inputs=files)
+            with run.report(summary) as summary:
+                write_pair_page(replace(result, summary=summary), run)
+            summary = run.finish(summary, source="im0.png", inputs=files)
 
     ``out`` None is a new folder below ``outputs/<command>/``, ``threads`` None all cores.
     """
@@ -81,29 +84,29 @@ class Run(RunDirectory):
         return self.watch.stage(name)
 
     @contextmanager
-    def report(self, summary: dict[str, Any]) -> Iterator[None]:
-        """Time the writing of the report, which finds the cost of the run in the summary."""
-        summary |= self._cost
+    def report(self, summary: Summary) -> Iterator[Summary]:
+        """Time the writing of the report, which is given the summary with the cost of the run."""
+        complete = replace(summary, **self._cost)
         with self.stage("report"):
-            yield
+            yield complete
 
     def finish(
         self,
-        summary: dict[str, Any],
+        summary: Summary,
         *,
         source: str,
         inputs: Iterable[Path],
         record: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Write ``summary.json`` and ``run.json``; the last thing that a run does.
+    ) -> Summary:
+        """Write ``summary.json`` and ``run.json``, the last thing that a run does.
 
-        The cost of the run and its folder are added to the figures, a hash of the inputs and what
-        else there is to ``record`` to the record.
+        The record gets a hash of the inputs, and what else there is to ``record``. Returned is the
+        summary with the cost of the run and its folder.
         """
         inputs = tuple(inputs)
         self.check_targets(inputs)
-        summary |= {**self._cost, "out": str(self.folder)}
-        self.write_json(SUMMARY, summary)
+        complete = replace(summary, **self._cost, out=str(self.folder))
+        self.write_json(SUMMARY, complete.to_json())
         with self.stage("hash"):
             hashed = fingerprint(inputs)
         self.write_json(
@@ -115,17 +118,18 @@ class Run(RunDirectory):
                 "source": source,
                 "inputs": hashed,
                 "timings": self._timings(),
-                "peak_memory_mb": summary["peak_memory_mb"],
-                "warnings": list(summary.get("warnings", ())),
+                "peak_memory_mb": complete.peak_memory_mb,
+                "warnings": list(complete.warnings),
                 **(record or {}),
                 # Last, since it lists all files.
                 "files": [*self.files(), RECORD],
             },
         )
+        return complete
 
     @cached_property
-    def _cost(self) -> dict[str, Any]:
-        """Seconds in all and per stage (stages overlap), and peak memory, taken once."""
+    def _cost(self) -> Mapping[str, Any]:
+        """Seconds in all and per stage, and peak memory, taken once."""
         return {
             "seconds": round(time.perf_counter() - self._start, 3),
             "stages": self._timings(),

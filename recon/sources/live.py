@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Condition, Thread
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from recon.core.text import counted, is_count
 from recon.core.values import Recorded
 from recon.core.values.arrays import UInt8
 from recon.io.images.image import silent_opencv
-from recon.sources.source import DerivedSource, StereoSource
+from recon.sources.source import DerivedSource, Latency, LiveFigures, SourceFigures, StereoSource
 
 # Pairs that may wait; where another comes, the oldest is dropped. With one, a slow consumer always
 # gets the newest pair, and what is dropped is spread evenly.
@@ -75,20 +75,19 @@ class LiveSource(DerivedSource):
         """Measure the time from the arrival of a pair to its pose."""
         self._latency_s.append(time.monotonic() - self._due_s[index])
 
-    def figures(self) -> dict[str, Any]:
-        marks = {"p50": 50, "p95": 95, "max": 100}
-        latency_ms: dict[str, float | None] = dict.fromkeys(marks)
+    def figures(self) -> SourceFigures:
+        latency_ms = Latency(None, None, None)
         if self._latency_s:
-            found = np.percentile(1e3 * np.array(self._latency_s), [*marks.values()]).tolist()
-            latency_ms = {name: round(value, 1) for name, value in zip(marks, found, strict=True)}
-        live = {
-            "rate": self.rate,
-            "frames_arrived": len(self._due_s) + self.dropped,
-            "frames_dropped": self.dropped,
-            "frames_not_matched": self._unmatched,
-            "latency_ms": latency_ms,
-        }
-        return {"live": live}
+            found = np.percentile(1e3 * np.array(self._latency_s), [50, 95, 100]).tolist()
+            latency_ms = Latency(*(round(value, 1) for value in found))
+        live = LiveFigures(
+            rate=self.rate,
+            frames_arrived=len(self._due_s) + self.dropped,
+            frames_dropped=self.dropped,
+            frames_not_matched=self._unmatched,
+            latency_ms=latency_ms,
+        )
+        return SourceFigures(live=live)
 
     def warnings(self) -> list[str]:
         lines = []

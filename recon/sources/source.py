@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from recon.core.errors import SourceError
+from recon.core.summary import Figures, optional
 from recon.core.text import counted, is_count
 from recon.core.values import ImuRecord, OccupancyTruth, Recorded, Rig, SequenceTruth, Trajectory
 from recon.core.values.arrays import Float64
@@ -26,6 +27,34 @@ class ReadPrior:
 
     path: Trajectory
     origin: str
+
+
+@dataclass(frozen=True)
+class Latency(Figures):
+    """Milliseconds from when an image was taken to its pose; None = there is no pose."""
+
+    p50: float | None
+    p95: float | None
+    max: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveFigures(Figures):
+    """How a drive was kept up with while its images arrived."""
+
+    rate: float | None  # how many times as fast as recorded it was played; None = cameras
+    frames_arrived: int
+    frames_dropped: int
+    frames_not_matched: int
+    latency_ms: Latency
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceFigures(Figures):
+    """What a source knows of a drive that was read."""
+
+    frames_left_out: int | None = optional()  # images without a partner
+    live: LiveFigures | None = optional()
 
 
 class StereoSource(ABC):
@@ -148,9 +177,9 @@ class StereoSource(ABC):
         """Return what the user should know of a drive that was read, in words."""
         return []
 
-    def figures(self) -> dict[str, Any]:
-        """Return the same for ``summary.json``."""
-        return {}
+    def figures(self) -> SourceFigures:
+        """Return the same as figures."""
+        return SourceFigures()
 
     def hurried(self) -> bool:
         """Return whether the next pair has arrived already, so that this one is late."""
@@ -221,8 +250,8 @@ class Recording(StereoSource):
         out = f"{counted(self.left_out, 'image')} without a partner: left out"
         return [out, *self.notes] if self.left_out else [*self.notes]
 
-    def figures(self) -> dict[str, Any]:
-        return {"frames_left_out": self.left_out}
+    def figures(self) -> SourceFigures:
+        return SourceFigures(frames_left_out=self.left_out)
 
 
 class DerivedSource(StereoSource):

@@ -168,8 +168,10 @@ class Viewer:
                 _add_grid(api, name, grid, height_m + 0.01 * scene.spacing_m * part)
         if mesh is not None and self._changed(name := f"/mesh/{number}", mesh):
             trimesh = require("trimesh", extra="view")
-            how: Any = {"vertex_colors": mesh.rgb, "process": False}
-            api.add_mesh_trimesh(name, trimesh.Trimesh(mesh.vertices, mesh.faces, **how))
+            shown = trimesh.Trimesh(
+                mesh.vertices, mesh.faces, vertex_colors=mesh.rgb, process=False
+            )
+            api.add_mesh_trimesh(name, shown)
         for path in scene.paths:
             name = f"/path/{number}_{path.name}"
             if self._changed(name, path, by):
@@ -211,5 +213,5 @@ def _add_grid(api: Any, name: str, grid: OccupancyGrid, height_m: float) -> None
     known = np.where(grid.cells[::-1] == UNKNOWN, 0, 255).astype(np.uint8)
     image, middle_m = np.dstack([colour_grid(grid), known]), np.array(grid.origin_m) + size_m / 2
     # viser shows images from behind, with y down.
-    where: Any = {"wxyz": (0.0, 1.0, 0.0, 0.0), "position": (*middle_m, height_m)}
-    api.add_image(name, image, *size_m.tolist(), **where)
+    position_m = (*middle_m, height_m)
+    api.add_image(name, image, *size_m.tolist(), wxyz=(0.0, 1.0, 0.0, 0.0), position=position_m)

@@ -7,12 +7,14 @@ from typing import Any
 import pytest
 
 from recon.cli.program import _NOT_OPTIONS, COMMANDS, _command, plan_jobs
-from recon.cli.tables import print_batch, print_evaluation, print_run
+from recon.cli.tables import print_batch, print_figures, print_remarks, print_rows
 from recon.commands import config
+from recon.commands.batch import BatchSummary
 from recon.commands.map_pieces import Piece, piece_job
 from recon.core.errors import SettingsError
 from recon.run.batch.job import Job
 from recon.run.batch.job_file import JobList
+from recon.run.batch.results import JobFacts, JobSummary
 from tests.docs.blocks import ROOT
 
 DRIVE = {"name": "a", "command": "map", "source": ["drive"]}
@@ -41,7 +43,7 @@ def test_a_command_line_has_what_the_job_says_and_limits_are_needs_of_a_worker()
     assert (job.timeout_s, job.retries, job.needs) == (5.0, 0, {"threads": 2.0, "memory": 4e9})
     sources = ["a.txt", "b.txt"]  # of a command that has no such limits
     words = line(command="evaluate trajectory", source=sources, threads=1, memory="2G")
-    assert words == ["evaluate", "trajectory", *sources, "--json", "--out", "out"]
+    assert words == ["evaluate", "trajectory", *sources, "--json", "--verbose", "--out", "out"]
 
 
 SOURCES = {
@@ -162,29 +164,50 @@ def test_jobs_that_are_none_are_one_line(changes, words):
     assert "\n" not in str(told.value)
 
 
-def job(name: str, state: str = "succeeded", **more: Any) -> dict[str, Any]:
-    return {
-        "name": name,
-        "state": state,
-        "tries": 1,
-        "seconds": 12.34,
-        "bytes": 5_000_000,
-        "figures": {},
+def job(name: str, state: str = "succeeded", **more: Any) -> JobSummary:
+    figures = more.pop("figures", {})
+    facts = JobFacts(
+        name=name,
+        command="map",
+        source="",
+        state=state,
+        tries=1,
+        seconds=12.34,
+        worker="",
+        bytes=5_000_000,
         **more,
-    }
+    )
+    return JobSummary(facts=facts, figures=figures, warnings=())
+
+
+def batch(jobs: list[JobSummary]) -> BatchSummary:
+    failed = sum(one.facts.state == "failed" for one in jobs)
+    ended = {"succeeded": len(jobs) - failed, "failed": failed, "not_run": 0}
+    return BatchSummary(jobs=jobs, **ended, bytes=0, jobs_per_hour=None, out="outputs/week")
 
 
 @pytest.mark.parametrize("name", ["drive[/b]", "[red]drive", "drive\x1b[2J\x9b2J", "\udcff\x07"])
 def test_a_name_is_printed_as_it_is_without_commands_to_the_terminal(name, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    figures = {"source": name, f"control {name}": "used", "warnings": [f"{name}: odd"]}
-    print_evaluation(name, figures)
-    print_run({**figures, "out": "outputs/week"})
+    print_remarks([("warning", f"{name}: odd")])
+    print_figures({"source": name, "control": {name: "used"}})
+    print_rows([(name,), ("cloud", name, name)])
     out, err = capsys.readouterr()
     said = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in name)
     assert out.count(said) == 5
-    assert err == 2 * f"warning: {said}: odd\n"
+    assert err == f"warning: {said}: odd\n"
     assert {letter for letter in out + err if not letter.isprintable()} == {"\n"}
+
+
+def test_warnings_that_differ_in_numbers_alone_are_counted_unless_all_are_asked_for(capsys):
+    remarks = [("warning", f"frame {n}: too dark") for n in range(3)] + [("note", "tilt it")]
+    print_remarks(remarks)
+    assert capsys.readouterr().err.splitlines() == [
+        "warning: frame 0: too dark (and 2 more like it)",
+        "note: tilt it",
+    ]
+    print_remarks(remarks, verbose=True)
+    assert len(capsys.readouterr().err.splitlines()) == 4
 
 
 def test_the_table_has_the_accuracy_of_each_command_and_not_all_of_very_many_jobs(
@@ -196,7 +219,7 @@ def test_the_table_has_the_accuracy_of_each_command_and_not_all_of_very_many_job
         job("pair_window=9", figures={"disparity.bad.2.0": 6.5, "points": 7.0}, remark="odd"),
         job("nowhere", "failed", error="there is no such folder"),
     ]
-    print_batch({"jobs": jobs, "out": "outputs/week"})
+    print_batch(batch(jobs), verbose=True)
     out, err = capsys.readouterr()
     for word in ("trajectory t", "disparity bad", "0.5123", "6.5", "drive_window=9"):
         assert word in out
@@ -204,7 +227,7 @@ def test_the_table_has_the_accuracy_of_each_command_and_not_all_of_very_many_job
     assert "remark: pair_window=9: odd" in out
     assert err == "error: nowhere: there is no such folder\n"
     assert max(map(len, out.splitlines())) <= 80
-    print_batch({"jobs": [job(f"j{n}") for n in range(1000)], "out": "outputs/week"})
+    print_batch(batch([job(f"j{n}") for n in range(1000)]), verbose=True)
     out = capsys.readouterr().out
     assert "j199 " in out
     assert "j200 " not in out

@@ -69,7 +69,7 @@ def run(drawn, tmp_path_factory):
 
 
 def test_images_give_the_true_rig_with_its_report_which_comes_back_from_every_format(run, tmp_path):
-    summary, rig = run.summary, board_rig()
+    summary, rig = run.summary.to_json(), board_rig()
     written = json.loads((Path(summary["out"]) / "summary.json").read_text())
     assert written == json.loads(json.dumps(summary))
     assert summary["stereo_rms_px"] < 0.15
@@ -87,7 +87,7 @@ def test_images_give_the_true_rig_with_its_report_which_comes_back_from_every_fo
         assert read.baseline_m == pytest.approx(run.fit.calibration.baseline_m, rel=1e-9)
         focal_px = summary["rectified_focal_px"]
         assert Rectifier(read).camera.focal_px == pytest.approx(focal_px, rel=1e-6)
-    out, summary = Path(run.summary["out"]), run.summary
+    out, summary = Path(run.summary.to_json()["out"]), run.summary.to_json()
     names = {path.name for path in out.rglob("*.png")}
     assert {"coverage.png", "epipolar_raw.png", "epipolar_rectified.png"} <= names
     # Eight views are too few to be sure of the forecast, however small it is.
@@ -126,9 +126,11 @@ def test_images_without_a_rig_are_refused_and_nothing_is_left(
 
 def test_a_board_without_a_size_gives_squares_and_says_so(drawn, tmp_path):
     run = calibrate(drawn, tmp_path, board="chess:9x6")
-    assert run.summary["baseline_squares"] == pytest.approx(0.12 / 0.025, rel=0.01)
-    assert run.summary["baseline_m"] == pytest.approx(run.summary["baseline_squares"])
-    assert any("in squares" in line for line in run.summary["warnings"])
+    assert run.summary.to_json()["baseline_squares"] == pytest.approx(0.12 / 0.025, rel=0.01)
+    assert run.summary.to_json()["baseline_m"] == pytest.approx(
+        run.summary.to_json()["baseline_squares"]
+    )
+    assert any("in squares" in line for line in run.summary.to_json()["warnings"])
 
 
 def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path):
@@ -167,7 +169,7 @@ def test_an_image_without_a_partner_is_left_out_and_counted(drawn, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(drawn, copy)
     (copy / "right02.png").unlink()
-    summary = calibrate(copy, tmp_path).summary
+    summary = calibrate(copy, tmp_path).summary.to_json()
     assert (summary["views"], summary["views_used"]) == (8, 7)
     told = {finding["code"]: finding["text"] for finding in summary["findings"]}
     assert told["unpaired"] == "images without a partner, left out: 1 (left02.png)"
@@ -188,9 +190,9 @@ def test_a_video_gives_one_view_for_each_place_where_the_board_stands_still(draw
     ]
     run = run_calibrate(*videos, BOARD, load_config(), out=tmp_path / "out")
     # In one of the nine places the right camera does not see the board.
-    assert 9 <= run.summary["views"] <= 11
-    assert run.summary["views_used"] == 8
-    assert run.summary["baseline_m"] == pytest.approx(board_rig().baseline_m, rel=0.005)
+    assert 9 <= run.summary.to_json()["views"] <= 11
+    assert run.summary.to_json()["views_used"] == 8
+    assert run.summary.to_json()["baseline_m"] == pytest.approx(board_rig().baseline_m, rel=0.005)
     numbers = [int(path.stem[4:]) for path in (tmp_path / "out" / "views").glob("left*.png")]
     assert all(number % 15 <= 9 for number in numbers)
 
@@ -206,7 +208,7 @@ def test_one_video_and_one_folder_are_refused(tmp_path):
 def test_the_published_chessboard_pairs_calibrate_as_they_should(recon_data, tmp_path):
     folder = recon_data / "calibration" / "opencv_chessboard"
     sides = (str(folder / "left*.jpg"), str(folder / "right*.jpg"))
-    summary = run_calibrate(*sides, BOARD, load_config(), out=tmp_path / "out").summary
+    summary = run_calibrate(*sides, BOARD, load_config(), out=tmp_path / "out").summary.to_json()
     assert summary["stereo_rms_px"] <= 0.45
     assert summary["baseline_squares"] == pytest.approx(3.34, abs=0.02)
     assert summary["epipolar_px"] <= 0.3
@@ -265,7 +267,7 @@ def test_a_calibration_gives_metric_pictures_and_none_of_rectified_ones(street, 
     run = run_rectify(*sides, load_config(), calibration=rig_file, out=out, threads=1)
     camera = read_calibration(tmp_path / "out" / "calibration.yaml", width, height)
     assert camera.baseline_m == pytest.approx(rig.baseline_m)
-    assert run.summary["up_to_scale"] is False
+    assert run.summary.to_json()["up_to_scale"] is False
     assert read_image(tmp_path / "out" / "left" / "0.png").shape == (height, width, 3)
 
 
@@ -324,7 +326,7 @@ def recorded(folder: Path, left_s: list[float], right_s: list[float], frames: in
     cameras = FakeCamera("l", left_s), FakeCamera("/dev/video2", right_s)
     cameras[1].exposure = 7.0
     settings = capture.RecordingSettings(frames=frames)
-    return cameras, record(cameras, folder, settings, None, lambda: False)
+    return cameras, record(cameras, folder, settings, None, lambda: False).to_json()
 
 
 def test_two_videos_are_recorded_and_mapped_at_once(pairs, tmp_path):
@@ -334,7 +336,7 @@ def test_two_videos_are_recorded_and_mapped_at_once(pairs, tmp_path):
     calibration = folder / "calib.txt"
     summary = run_capture(
         devices, out, capture.RecordingSettings(preview_every=4), calibration=calibration
-    )
+    ).to_json()
     assert (summary["frames"], summary["rate_hz"]) == (12, pytest.approx(10, rel=1e-3))
     assert summary["skew_max_ms"] == 0
     assert (out / "preview.jpg").is_file()

@@ -42,7 +42,7 @@ def run(tmp_path):
 @pytest.mark.parametrize("frame", ["camera", "map"])
 def test_a_run_equals_itself_in_either_frame(run, inside, frame):
     reference = run.parent / f"in_{frame}.ply"
-    figures = run_evaluate_map(run / inside, reference, frame=frame)
+    figures = run_evaluate_map(run / inside, reference, frame=frame).to_json()
     assert (figures["f_score"], figures["warnings"]) == (1.0, [])
     # Both clouds are thinned on grids that start elsewhere, after a rotation of float32 points.
     assert 0.0 <= figures["p95_m"] < 0.15
@@ -50,7 +50,7 @@ def test_a_run_equals_itself_in_either_frame(run, inside, frame):
 
 @pytest.mark.parametrize(("right", "wrong"), [("map", "camera"), ("camera", "map")])
 def test_the_wrong_frame_does_not_fit_and_the_right_one_is_named(run, right, wrong):
-    figures = run_evaluate_map(run, run.parent / f"in_{right}.ply", frame=wrong)
+    figures = run_evaluate_map(run, run.parent / f"in_{right}.ply", frame=wrong).to_json()
     assert figures["f_score"] < 0.5
     (doubt,) = figures["warnings"]
     assert f"--reference-frame {right}" in doubt
@@ -58,10 +58,10 @@ def test_the_wrong_frame_does_not_fit_and_the_right_one_is_named(run, right, wro
 
 def test_a_cloud_of_no_run_is_taken_as_it_is_and_clouds_apart_are_said_to_be(run):
     reference, far = run.parent / "in_camera.ply", run.parent / "far.ply"
-    assert run_evaluate_map(reference, reference, frame="camera")["f_score"] == 1.0
+    assert run_evaluate_map(reference, reference, frame="camera").to_json()["f_score"] == 1.0
     cloud = read_ply(reference)
     write_ply(far, replace(cloud, xyz=cloud.xyz + np.float32(50)))
-    (doubt,) = run_evaluate_map(run, far)["warnings"]
+    (doubt,) = run_evaluate_map(run, far).to_json()["warnings"]
     assert "hardly meet" in doubt
 
 
@@ -98,8 +98,8 @@ def drifted(tmp_path):
 
 def test_a_fit_of_the_paths_undoes_what_both_share_and_clouds_are_coloured_by_their_errors(drifted):
     files, out = (drifted / "drift", drifted / "reference.ply"), drifted / "out"
-    assert run_evaluate_map(*files)["f_score"] < 0.7
-    found = run_evaluate_map(*files, align_to=drifted / "poses.txt", out=out)
+    assert run_evaluate_map(*files).to_json()["f_score"] < 0.7
+    found = run_evaluate_map(*files, align_to=drifted / "poses.txt", out=out).to_json()
     assert (found["f_score"], found["alignment"]) == (1.0, "poses")
     # The written path has twelve decimals; the turn made was 0.84 degrees.
     assert found["path_turned_deg"] == pytest.approx(np.degrees(np.sqrt(2.16e-4)), rel=1e-3)
@@ -113,7 +113,7 @@ def test_a_fit_of_the_paths_undoes_what_both_share_and_clouds_are_coloured_by_th
 
 def test_icp_lays_the_cloud_onto_the_reference_and_every_threshold_has_its_figures(drifted):
     files = (drifted / "drift", drifted / "reference.ply")
-    found = run_evaluate_map(*files, icp=True, thresholds_m=(0.1, 0.2))
+    found = run_evaluate_map(*files, icp=True, thresholds_m=(0.1, 0.2)).to_json()
     assert found["icp_ratio"] > 0.9
     assert 0.1 < found["icp_moved_m"] < 1.5
     first, second = (one["f_score"] for one in found["by_threshold"])
@@ -124,12 +124,12 @@ def test_icp_lays_the_cloud_onto_the_reference_and_every_threshold_has_its_figur
 
 def test_icp_finds_out_in_which_axes_the_reference_is(drifted):
     folder, reference = drifted / "drift", drifted / "reference.ply"
-    assert run_evaluate_map(folder, reference, icp=True)["reference_frame"] == "camera"
+    assert run_evaluate_map(folder, reference, icp=True).to_json()["reference_frame"] == "camera"
     in_map = transform_cloud(read_ply(reference), T_MAP_WORLD, frame="map")
     write_ply(reference, in_map)
-    found = run_evaluate_map(folder, reference, icp=True)
+    found = run_evaluate_map(folder, reference, icp=True).to_json()
     assert found["reference_frame"] == "map"
-    told = run_evaluate_map(folder, reference, icp=True, frame="map")
+    told = run_evaluate_map(folder, reference, icp=True, frame="map").to_json()
     # Open3D adds up in threads, so its last digits differ from run to run.
     for name in ("f_score", "icp_moved_m", "icp_turned_deg", "median_m"):
         assert found[name] == pytest.approx(told[name], rel=1e-6)
@@ -147,7 +147,7 @@ def test_what_stands_above_all_of_the_reference_is_not_judged(drifted):
     xyz = np.concatenate([cloud.xyz, crowns])
     write_ply(drifted / "drift" / "map" / "cloud.ply", PointCloud(xyz, frame="map"))
     files = (drifted / "drift", drifted / "reference.ply")
-    found = run_evaluate_map(*files, align_to=drifted / "poses.txt")
+    found = run_evaluate_map(*files, align_to=drifted / "poses.txt").to_json()
     assert found["precision"] < 0.8
     assert found["precision_in_reach"] == 1.0
     assert found["beyond_reach"] == pytest.approx(9000 / len(xyz), abs=1e-3)
@@ -191,14 +191,14 @@ def folder(tmp_path):
 
 
 def test_paths_are_compared_by_time_where_both_have_times_else_in_order(folder):
-    found = run_evaluate_trajectory(folder / "half.txt", folder / "truth_tum.txt", RULES)
+    found = run_evaluate_trajectory(folder / "half.txt", folder / "truth_tum.txt", RULES).to_json()
     assert found["associated"] == "by time"
     assert (found["frames"], found["estimate_poses"], found["true_poses"]) == (60, 60, 120)
     assert found["ate_m"] < 1e-6
     assert found["warnings"] == []
     files, times = (folder / "half_kitti.txt", folder / "truth_tum.txt"), folder / "times.txt"
-    assert run_evaluate_trajectory(*files, RULES, times=times)["frames"] == 60
-    found = run_evaluate_trajectory(folder / "truth_tum.txt", folder / "truth.txt", RULES)
+    assert run_evaluate_trajectory(*files, RULES, times=times).to_json()["frames"] == 60
+    found = run_evaluate_trajectory(folder / "truth_tum.txt", folder / "truth.txt", RULES).to_json()
     assert (found["associated"], found["frames"]) == ("in order", 120)
     assert found["ate_m"] < 1e-6
     with pytest.raises(EvaluationError, match=r"got 60 poses, expected 120 poses\); without times"):
@@ -208,7 +208,7 @@ def test_paths_are_compared_by_time_where_both_have_times_else_in_order(folder):
     poses[:, 2, 3] = np.arange(60)
     write_tum(folder / "drifting.txt", Trajectory(poses, times))
     files = (folder / "half.txt", folder / "drifting.txt")
-    found = run_evaluate_trajectory(*files, RULES, tolerance_s=0.01)
+    found = run_evaluate_trajectory(*files, RULES, tolerance_s=0.01).to_json()
     assert found["warnings"] == ["a partner in time for only 20 of 60 poses; see --tolerance"]
 
 
@@ -221,7 +221,7 @@ def test_the_alignment_is_given_as_a_transform_with_the_offset_of_survey_coordin
     write_tum(folder / "survey.txt", Trajectory(T_survey_world @ poses, path.timestamps_s))
     rules = TrajectoryRules(alignment="sim3")
     files = (folder / "half.txt", folder / "survey.txt")
-    found = run_evaluate_trajectory(*files, rules)
+    found = run_evaluate_trajectory(*files, rules).to_json()
     assert found["scale"] == pytest.approx(2, abs=1e-9)
     # Doubles of 5e6 m are 1e-9 m apart; means and products of a few of them stay below 1e-6 m.
     np.testing.assert_allclose(found["T_truth_estimate"], T_survey_world, rtol=0, atol=1e-6)
@@ -229,7 +229,9 @@ def test_the_alignment_is_given_as_a_transform_with_the_offset_of_survey_coordin
 
 def test_a_folder_gets_report_figures_and_aligned_paths(folder):
     out = folder / "out"
-    found = run_evaluate_trajectory(folder / "half.txt", folder / "truth_tum.txt", RULES, out=out)
+    found = run_evaluate_trajectory(
+        folder / "half.txt", folder / "truth_tum.txt", RULES, out=out
+    ).to_json()
     figures = {"path", "error_along_path", "translation_by_length", "rotation_by_length"}
     assert {path.name for path in out.iterdir()} == {f"{name}.png" for name in figures} | {
         "estimate_aligned_tum.txt", "truth_tum.txt", "report.html", "run.json", "summary.json",
@@ -239,7 +241,7 @@ def test_a_folder_gets_report_figures_and_aligned_paths(folder):
     assert "half.txt against truth_tum.txt" in page
     assert page.count("<img") == 4
     files, rules = (out / "estimate_aligned_tum.txt", out / "truth_tum.txt"), TrajectoryRules
-    again = run_evaluate_trajectory(*files, rules(alignment="none"))
+    again = run_evaluate_trajectory(*files, rules(alignment="none")).to_json()
     assert again["ate_m"] == pytest.approx(found["ate_m"], abs=1e-9)
 
 

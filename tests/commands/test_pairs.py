@@ -106,8 +106,10 @@ def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(images, tmp_pat
     given = read(images, SourceSettings(focal_px=300))
     settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
     run = run_pair(given, settings, out=tmp_path / "out")
-    assert run.summary["up_to_scale"] is True
-    assert run.summary["depth_median_m"] == pytest.approx(300 / 12, rel=0.01)  # in baselines
+    assert run.summary.to_json()["up_to_scale"] is True
+    assert run.summary.to_json()["depth_median_m"] == pytest.approx(
+        300 / 12, rel=0.01
+    )  # in baselines
     assert [text for text in run.warnings if "in baselines, not in metres" in text]
 
 

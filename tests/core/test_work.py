@@ -222,5 +222,5 @@ def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(tmp_path, monkeypa
     assert (config.memory.limit_mb, config.submaps.length_m) == (700, 4)
     assert options.source == str(drive)
     run = run_map(source, config, replace(options, audit=False))
-    assert run.summary["frames"] == 12
+    assert run.summary.to_json()["frames"] == 12
     assert "limit_mb: 700" in (out / "config.yaml").read_text()

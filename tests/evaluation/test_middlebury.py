@@ -181,7 +181,7 @@ def test_scenes_and_results_of_a_folder_become_figures(tmp_path):
     assert bench.read_result(theirs, scenes["Vintage"]) is None
     (own,) = bench.Bench([Shifted(true)], StereoSettings(), 1).results(teddy)
     figures = {"Teddy": {"shifted": own.figures, "theirs": given.figures}, "Vintage": None}
-    summary = bench.summarise_scenes(figures, ["shifted", "theirs"], [theirs], tmp_path)
+    summary = bench.summarise_scenes(figures, ["shifted", "theirs"], [theirs], tmp_path).to_json()
     for name, error_px in (("shifted", 4.0), ("theirs", 2.0)):
         mask = summary["matchers"][name]["weighted"]["nonocc"]
         # A pixel is four full-size ones here; what is exactly off by a limit is not bad.
@@ -219,7 +219,7 @@ def test_what_was_measured_and_what_was_inferred_are_scored_apart(tmp_path):
     folder, out = tmp_path / "trainingQ", tmp_path / "out"
     write_scene(folder / "Teddy", square())
     true = bench.read_scored_scene("Teddy", folder / "Teddy", None).truth.values
-    summary = run_middlebury(folder, matchers=[Both(true)], out=out)
+    summary = run_middlebury(folder, matchers=[Both(true)], out=out).to_json()
     (found,) = summary["matchers"].values()
     for figures in (found["weighted"], found["scenes"]["Teddy"]):
         measured, inferred = (figures["all"][kind] for kind in ("measured", "inferred"))
@@ -271,7 +271,9 @@ ANCHORS = {"opencv-bm": (42.4, 28.6, 21.1, 12.2), "opencv-sgbm": (40.3, 23.0, 15
 @pytest.mark.real
 def test_opencv_scores_as_it_was_measured_elsewhere(recon_data, tmp_path):
     folder = recon_data / "middlebury" / "MiddEval3" / "trainingQ"
-    found = run_middlebury(folder, matchers=tuple(ANCHORS), out=tmp_path / "run")["matchers"]
+    found = run_middlebury(folder, matchers=tuple(ANCHORS), out=tmp_path / "run").to_json()[
+        "matchers"
+    ]
     for matcher, anchors in ANCHORS.items():
         assert len(found[matcher]["scenes"]) == 8
         dense = found[matcher]["weighted"]["nonocc"]["dense"]

@@ -27,8 +27,8 @@ def test_true_depths_have_no_error_and_those_of_table_1_a_large_one():
     truth = DisparityTruth(values, np.isfinite(values))
     believed_m = depth_from_disparity(values, paper.camera_of_table_1(CAMERA))
     assert np.allclose(believed_m, 50 * 0.16 / values, rtol=1e-6)
-    right = paper.compare_depth(depth_from_disparity(values, CAMERA), truth, CAMERA) or {}
-    wrong = paper.compare_depth(believed_m, truth, CAMERA) or {}
+    right = paper.compare_depth(depth_from_disparity(values, CAMERA), truth, CAMERA).to_json()
+    wrong = paper.compare_depth(believed_m, truth, CAMERA).to_json()
     assert (right["median_error_percent"], right["median_ratio"]) == (0, 1)
     # Z'/Z = doffs·(d + doffs) / (f·d): 0.22 at d = 16, 0.10 at d = 58.
     assert 0.10 < wrong["median_ratio"] < 0.22

@@ -325,7 +325,7 @@ def test_two_files_with_times_are_compared_by_them_as_the_command_does(tmp_path)
     rules = TrajectoryRules(lengths_m=(10.0,))
     metrics = evaluate_trajectory(*files, rules)
     assert metrics.frames == 30
-    assert run_evaluate_trajectory(*files, rules)["ate_m"] == metrics.ate_m
+    assert run_evaluate_trajectory(*files, rules).to_json()["ate_m"] == metrics.ate_m
     expected = compare_paths(found, truth.select(np.arange(10, 70, 2)), rules).metrics
     assert metrics.ate_m == pytest.approx(expected.ate_m, abs=1e-9)
     with pytest.raises(EvaluationError, match="match in time"):

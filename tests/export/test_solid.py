@@ -151,7 +151,7 @@ def test_a_pair_becomes_a_body_by_a_setting(tmp_path):
     given = read_pair_input(*(scene / name for name in ("im0.png", "im1.png", "calib.txt")))
     config = load_config(None, ["mesh.pair_solid_m=0.01"], PAIR_DEFAULTS)
     made = run_pair(given, config, out=out, formats=("obj", "glb"))
-    assert made.summary["mesh_coverage"] > 0.8
+    assert made.summary.to_json()["mesh_coverage"] > 0.8
     for name in ("mesh.ply", "mesh.obj", "mesh.glb"):
         body = trimesh.load(out / "mesh" / name, force="mesh")
         body.merge_vertices(merge_tex=True, merge_norm=True)

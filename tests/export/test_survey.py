@@ -87,7 +87,7 @@ def test_antenna_and_times_between_frames_count(place):
     off = invert(T_SURVEY_MAP) @ placed.T_survey_map
     assert np.abs(off[:3, 3]).max() < 0.002
     assert np.degrees(angle_rad(off[None])[0]) < 0.01
-    assert placed.figures()["positions"] == 20
+    assert placed.figures().to_json()["positions"] == 20
     assert placed.rms_m < 0.001
     assert placed.tilt_deg < 0.01
     assert not placed.warnings()
@@ -111,7 +111,10 @@ def test_positions_that_contradict_most_are_left_out_and_named(place):
     rows[17, 1:] = 0.0  # no fix
     placed = place(rows)
     np.testing.assert_allclose(placed.T_survey_map, T_SURVEY_MAP, atol=0.002)
-    assert (placed.figures()["positions"], placed.figures()["positions_left_out"]) == (17, 3)
+    assert (
+        placed.figures().to_json()["positions"],
+        placed.figures().to_json()["positions_left_out"],
+    ) == (17, 3)
     (warning,) = placed.warnings()
     assert "3 of 20 positions contradict the others" in warning
     assert f"{FROM_S + 3:.3f} s" in warning
@@ -185,7 +188,7 @@ def test_positions_that_fix_no_direction_are_refused(place, rows):
 def test_how_well_positions_fix_the_rotation_is_stated(place):
     """Two of 2 cm, 25 m apart, the line through which turns with the level of the map: 3 deg."""
     rows = np.column_stack([positions(FROM_S + np.array([2.0, 7.0])), np.full(2, 0.02)])
-    figures = place(rows).figures()
+    figures = place(rows).figures().to_json()
     apart_m = np.linalg.norm(rows[1, 1:3] - rows[0, 1:3])
     climb = (rows[1, 3] - rows[0, 3]) / apart_m
     expected_deg = np.hypot(np.degrees(0.02 * np.sqrt(2.0) / apart_m), 3.0 * climb)
@@ -206,7 +209,7 @@ def test_a_roll_about_a_straight_path_moves_no_frame_of_it(place):
         session.add_frame(T, time_s, OdometryHealth())
     there_m = np.column_stack([np.zeros(50), np.arange(50.0), np.full(50, 1000.0)])
     rows = np.column_stack([times_s, there_m, np.full(50, 0.02)])
-    figures = place(rows, map_, antenna=(0.0, 0.0, 0.0)).figures()
+    figures = place(rows, map_, antenna=(0.0, 0.0, 0.0)).figures().to_json()
     assert figures["rotation_sigma_deg"] == pytest.approx(3.0, rel=0.01)
     assert figures["edge_sigma_m"] < 0.02
 
@@ -227,7 +230,7 @@ def test_the_stated_yaw_is_what_noise_makes_of_it(place):
         off = (invert(T_SURVEY_MAP) @ placed.T_survey_map)[:3, :3]
         turned.append(np.degrees(np.arctan2(off[1, 0], off[0, 0])))
     # Of 60 samples, a standard deviation is known to 9 %: three of those.
-    assert np.std(turned) == pytest.approx(placed.figures()["yaw_sigma_deg"], rel=0.3)
+    assert np.std(turned) == pytest.approx(placed.figures().to_json()["yaw_sigma_deg"], rel=0.3)
 
 
 @pytest.mark.parametrize("columns", [1, 3])
@@ -236,7 +239,7 @@ def test_a_file_may_state_how_well_positions_were_measured(place, columns):
         rows = noisy(10.0)
         return np.column_stack([rows, np.full((len(rows), columns), sigma_m)])
 
-    assert place(noisy(1.5, seed=4)).figures()["positions_left_out"] == 0
+    assert place(noisy(1.5, seed=4)).figures().to_json()["positions_left_out"] == 0
     assert 10.0 < place(noisy(10.0)).rms_m < 20.0
     assert place(stated(10.0)).rms_m > 10.0
     with pytest.raises(EvaluationError, match="neither drift nor noise explains"):

@@ -68,7 +68,7 @@ def test_live_the_segments_are_the_same_and_said_first(
 ):
     be_patient(monkeypatch)
     options = MapOptions("live", tmp_path, mesh=False)
-    summary, count = run_live(broken, load_config(), options, rate=10.0), len(street_film)
+    summary, count = run_live(broken, load_config(), options, rate=10.0).to_json(), len(street_film)
     segments = [(one["first"], one["joined"]) for one in summary["segments"]]
     assert segments == [(0, True), (count, False), (count + 5, True)]
     assert summary["warnings"][0].startswith("TRAJECTORY HAS 3 SEGMENTS")

@@ -224,9 +224,8 @@ def test_missing_scenes_are_named_and_left_out_of_all_means(quarter, truth, resu
     write_pfm(tmp_path / "a" / "maps" / "Teddy.pfm", truth + np.float32(3))
     write_pfm(tmp_path / "b" / "maps" / "Teddy.pfm", truth)
     given = [f"--results={tmp_path / name / 'maps'}" for name in ("a", "b")]
-    done = middlebury(
-        quarter, "--matcher", "none", *given, "--results", results / "mine", "--out", tmp_path / "o"
-    )
+    given += [f"--results={results / 'mine'}", f"--out={tmp_path / 'o'}"]
+    done = middlebury(quarter, "--matcher", "none", *given, "--verbose")
     assert done.code == 0, done.err
     means = "means are over 1 of 2 scenes, which all have"
     assert f"a/maps: no result for Vintage; {means}" in done.err
@@ -272,7 +271,9 @@ class Known:
 
 def test_ones_own_matcher_is_a_column_too(quarter, results, tmp_path):
     mine, out = [str(results / "mine")], tmp_path / "run"
-    summary = recon.run_middlebury(str(quarter), matchers=[Known()], results=mine, out=out)
+    summary = recon.run_middlebury(
+        str(quarter), matchers=[Known()], results=mine, out=out
+    ).to_json()
     assert list(summary["matchers"]) == ["known", "mine"]
     weighted = summary["matchers"]["known"]["weighted"]
     assert weighted["all"]["invalid"] == 50

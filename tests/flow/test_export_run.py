@@ -47,7 +47,7 @@ def assert_equal(one: Path, other: Path, *names: str) -> None:
 def test_all_products_come_in_one_go_and_nothing_is_matched(small_demo, tmp_path, monkeypatch):
     monkeypatch.delattr(observe, "make_matcher")
     config = run_settings(small_demo, None, ["mesh.depth=5", "mesh.min_component_faces=10"])
-    summary = run_export(small_demo, config, formats=("ply", "glb"), out=tmp_path / "out")
+    summary = run_export(small_demo, config, formats=("ply", "glb"), out=tmp_path / "out").to_json()
     assert_equal(tmp_path / "out", small_demo, "map/cloud.ply", *MAPS)
     assert len(read_mesh(tmp_path / "out/mesh/mesh.glb").faces) == summary["faces"] > 100
     assert summary["points"] == len(read_ply(small_demo / "map/cloud.ply"))
@@ -237,7 +237,7 @@ def without_rays(small_demo, tmp_path):
 
 
 def test_what_is_not_there_is_told(without_rays, tmp_path):
-    summary = run_export(without_rays, products=["cloud"], out=tmp_path / "out")
+    summary = run_export(without_rays, products=["cloud"], out=tmp_path / "out").to_json()
     assert summary["points"] > 1000
     other = tmp_path / "other"
     with pytest.raises(FormatError, match=r"kept no rays to build occupancy from.*keep_rays=true"):
@@ -268,7 +268,7 @@ def test_a_pair_gives_its_cloud_and_mesh_and_no_grid(tmp_path):
     shallow = ["mesh.max_depth=5"]
     run_pair(PairInput(pair, camera), load_config(None, shallow, PAIR_DEFAULTS), out=run)
     config = run_settings(run, None, shallow)
-    summary = run_export(run, config, formats=("ply", "glb"), out=tmp_path / "out")
+    summary = run_export(run, config, formats=("ply", "glb"), out=tmp_path / "out").to_json()
     assert_equal(tmp_path / "out", run, "clouds/cloud.ply")
     assert len(read_mesh(tmp_path / "out/mesh/mesh.glb").faces) == summary["faces"]
     assert summary["mesh_coverage"] > 0.5
@@ -279,7 +279,7 @@ def test_a_pair_gives_its_cloud_and_mesh_and_no_grid(tmp_path):
 def mesh_of(run: Path, out: Path, *settings: str) -> dict[str, Any]:
     # What is written is asked, not how fine it is.
     config = load_config(None, ["mesh.tile_m=10", "mesh.max_depth=5", *settings])
-    return run_mesh(run, config, out=out, formats=("ply", "glb"))
+    return run_mesh(run, config, out=out, formats=("ply", "glb")).to_json()
 
 
 def layers(out: Path) -> list[str]:
@@ -315,7 +315,7 @@ def test_one_piece_is_the_mesh_itself_without_the_faces_in_free_space(
 
 
 def _remake(run: Path, out: Path, *overrides: str) -> dict[str, Any]:
-    return run_occupancy(run, run_settings(run, None, overrides), out=out)
+    return run_occupancy(run, run_settings(run, None, overrides), out=out).to_json()
 
 
 @pytest.fixture
@@ -450,7 +450,7 @@ def test_occupied_and_free_are_where_they_really_are(street, tmp_path):
     options = MapOptions(audit=False, out=tmp_path / "run", mesh=False)
     mapped = run_map(demo_source(config), config, options)
     found = mapped.errors.occupancy
-    assert mapped.summary["occupancy"]["voxels"]["recall"] == found.voxels.recall
+    assert mapped.summary.to_json()["occupancy"]["voxels"]["recall"] == found.voxels.recall
     # What is asked for, seen at least three times; measured 0.94 to 0.96, and 0.98.
     assert found.voxels.precision >= 0.9
     assert found.voxels.recall >= 0.9

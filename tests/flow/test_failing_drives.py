@@ -170,7 +170,7 @@ def test_an_empty_map_of_frames_that_share_no_place_is_told_in_one_sentence(seen
 def test_a_baseline_in_another_unit_is_warned_of_and_throws_nothing_away(seen, tmp_path):
     run = map_drive(seen[:4], tmp_path, baseline=1000, audit=True)
     assert "baseline is implausible: 540 m" in " ".join(run.warnings)
-    assert run.summary["scale"] == 1000.0
+    assert run.summary.to_json()["scale"] == 1000.0
     assert len(run.cloud)
 
 
@@ -185,7 +185,7 @@ def body_path(change: Callable[[np.ndarray], np.ndarray] = np.copy) -> Trajector
 def test_a_prior_in_body_axes_is_recognised(seen, tmp_path):
     run = map_drive(seen, tmp_path, prior=body_path())
     assert not doubted(run)
-    told = run.summary["prior"]
+    told = run.summary.to_json()["prior"]
     assert (told["axes"], told["known_from"]) == ("body", "images")
     assert told["sigmas"]["camera"] > 5
     assert off_m(run, ROAD, 9) < ALLOWED_M
@@ -258,8 +258,8 @@ def runs(seen, tmp_path_factory):
     bad = map_drive([*seen[:8], *BARE.pairs(range(10, 14))], root / "bad")
     assert doubted(bad) == [8, 9, 10, 11]
     assert bad.warnings[1].startswith("frames 8-11: the pose is not to be trusted")
-    assert _said(bad.summary, root / "bad" / "out") == bad.warnings[0]
-    assert bad.summary["frames_not_trusted"] == 4
+    assert _said(bad.summary.to_json(), root / "bad" / "out") == bad.warnings[0]
+    assert bad.summary.to_json()["frames_not_trusted"] == 4
     map_drive(seen[4:], root / "good")
     return root
 
@@ -279,27 +279,29 @@ def test_every_later_command_says_that_poses_are_doubted(runs, tmp_path):
     cloud, path, rules = good / "map" / "cloud.ply", "trajectory_tum.txt", TrajectoryRules()
     out = {name: tmp_path / name for name in ("export", "mesh", "occupancy", "found")}
     alone = [
-        _said(run_export(bad, products=["cloud", "grid"], out=out["export"]), out["export"]),
-        _said(run_occupancy(bad, out=out["occupancy"]), out["occupancy"]),
-        _said(run_mesh(bad, load_config(), out=out["mesh"]), out["mesh"]),
+        _said(
+            run_export(bad, products=["cloud", "grid"], out=out["export"]).to_json(), out["export"]
+        ),
+        _said(run_occupancy(bad, out=out["occupancy"]).to_json(), out["occupancy"]),
+        _said(run_mesh(bad, load_config(), out=out["mesh"]).to_json(), out["mesh"]),
         # A run without a map of its own knows it from the run that it was made from.
-        run_evaluate_map(out["export"], cloud)["warnings"][0],
-        run_evaluate_map(bad, cloud)["warnings"][0],
-        run_evaluate_trajectory(bad / path, good / path, rules)["warnings"][0],
+        run_evaluate_map(out["export"], cloud).to_json()["warnings"][0],
+        run_evaluate_map(bad, cloud).to_json()["warnings"][0],
+        run_evaluate_trajectory(bad / path, good / path, rules).to_json()["warnings"][0],
     ]
     drive = open_source(runs / "good" / "drive")
     options = MapOptions("localize", out["found"])
-    alone.append(_said(run_localize(drive, bad, options=options).summary, out["found"]))
+    alone.append(_said(run_localize(drive, bad, options=options).summary.to_json(), out["found"]))
     for line in alone:
         assert line.startswith(DOUBT)
 
 
 def test_a_merged_map_says_which_drive_is_doubted(runs, tmp_path):
     out, parts = tmp_path / "merged", [runs / name / "out" for name in ("good", "bad")]
-    merged = run_merge(parts, options=MapOptions("merge", out, mesh=False))
+    merged = run_merge(parts, options=MapOptions("merge", out, mesh=False)).to_json()
     assert _said(merged, out).startswith(f"session 1 (drive): {DOUBT}")
     assert [one["frames_not_trusted"] for one in merged["sessions"]] == [0, 4]
     assert [one["frames_placed"] for one in merged["sessions"]] == [6, 8]
     assert DOUBT in (out / "report.html").read_text()
-    after = run_remove(out, 0, None, MapOptions(mesh=False))
+    after = run_remove(out, 0, None, MapOptions(mesh=False)).to_json()
     assert after["warnings"][0].startswith(DOUBT)

@@ -80,7 +80,7 @@ def play(tmp_path, watch):
     def play_drive(source, config=None, rate=10.0, **options):
         into = MapOptions("live", tmp_path / "live", mesh=False)
         with showing(watch):
-            return run_live(source, config or load_config(), into, rate=rate, **options)
+            return run_live(source, config or load_config(), into, rate=rate, **options).to_json()
 
     return play_drive
 

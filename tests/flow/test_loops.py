@@ -94,7 +94,7 @@ def test_a_drive_broken_off_closes_the_same_way(block, closed, tmp_path):
     run = _run(block, tmp_path, resume=True)
     assert {"loops.json", "trajectory_odometry_tum.txt"} <= _content(tmp_path).keys()
     assert _content(tmp_path) == _content(closed[0])
-    assert run.summary["loops"] == closed[1].summary["loops"]
+    assert run.summary.to_json()["loops"] == closed[1].summary.to_json()["loops"]
 
 
 def test_a_walk_round_a_room_with_mirrors_and_windows_closes(tmp_path):
@@ -103,10 +103,10 @@ def test_a_walk_round_a_room_with_mirrors_and_windows_closes(tmp_path):
     walk = film(StreetScene(path="room", seed=2, frames=90, speed_m_per_frame=0.2, **size))
     walk.truth = SequenceTruth(walk.trajectory)
     run = _run(walk, tmp_path)
-    assert run.summary["frames_joined"] == len(walk)
-    assert run.summary["trajectory"]["ate_m"] < 0.005 * walk.trajectory.path_length_m
-    assert run.summary["loops"]["closed"] >= 10
-    assert run.summary["loops"]["refused_by_graph"] == 0
+    assert run.summary.to_json()["frames_joined"] == len(walk)
+    assert run.summary.to_json()["trajectory"]["ate_m"] < 0.005 * walk.trajectory.path_length_m
+    assert run.summary.to_json()["loops"]["closed"] >= 10
+    assert run.summary.to_json()["loops"]["refused_by_graph"] == 0
 
 
 def test_a_street_that_repeats_itself_is_mapped_without_loops(tmp_path):
@@ -115,8 +115,8 @@ def test_a_street_that_repeats_itself_is_mapped_without_loops(tmp_path):
     _run(drive, tmp_path / "off", "loops.enabled=false")
     with patch.multiple("recon.places.places", SHARE=1.0, TURN_DEG=5.0):
         blind = _run(drive, tmp_path / "blind")
-    assert looked.summary["loops"]["found"] == 0
+    assert looked.summary.to_json()["loops"]["found"] == 0
     assert _content(tmp_path / "looked") == _content(tmp_path / "off")
     assert not (tmp_path / "looked" / "loops.json").exists()
     # The trap is a real one: images and shapes alone would have closed it.
-    assert blind.summary["loops"]["found"] >= 3
+    assert blind.summary.to_json()["loops"]["found"] >= 3

@@ -80,7 +80,9 @@ def test_one_run_is_held_at_measured_positions(runs, tmp_path):
     longer_m = 1.01 * before.positions_m @ AXES_MAP_WORLD.T
     np.savetxt(tmp_path / "gnss.txt", np.column_stack([before.timestamps_s, longer_m]))
     out, survey = tmp_path / "held", Survey(tmp_path / "gnss.txt")
-    found = run_merge([runs / "first"], None, MapOptions("merge", out, mesh=False), survey)
+    found = run_merge(
+        [runs / "first"], None, MapOptions("merge", out, mesh=False), survey
+    ).to_json()
     assert found["sessions"][0]["positions"] == FRAMES
     assert found["positions_misfit_rms_m"] < 0.03
     held = read_trajectory(out / "sessions/0/trajectory_tum.txt")
@@ -109,7 +111,7 @@ def test_a_drive_is_added_to_a_run_and_taken_out_again(run, runs):
     with pytest.raises(FormatError, match=r"^film 0 to 10: the map has this"):
         run_map_into(run, part(0), None, OPTIONS)
     assert all_files(run.parent) == before
-    added = run_map_into(run, part(FIRST), None, OPTIONS)
+    added = run_map_into(run, part(FIRST), None, OPTIONS).to_json()
     assert [drive["linked"] for drive in added["sessions"]] == [True, True]
     assert summary_of(run)["sessions"] == added["sessions"]
     run_remove(run, 1, None, OPTIONS)
@@ -122,7 +124,7 @@ def test_a_drive_is_added_to_a_run_and_taken_out_again(run, runs):
 
 def test_a_drive_that_is_added_begins_with_the_rig_of_the_last_one(run):
     turned = keep_turned_rig(run)
-    added = run_map_into(run, part(FIRST), None, OPTIONS)
+    added = run_map_into(run, part(FIRST), None, OPTIONS).to_json()
     assert [drive["rig"]["refined"] for drive in added["sessions"]] == [True, True]
     assert (run / "rig.yaml").is_file()
     with Map.open(run) as map_:

@@ -336,7 +336,7 @@ def test_a_map_that_says_nothing_or_nonsense_of_its_images_is_refused(
 def test_a_textured_drive_shows_its_images_in_other_programs(small_demo, tmp_path):
     out = tmp_path / "out"
     formats = ("obj", "glb")
-    figures = run_export(small_demo, products=["texture"], formats=formats, out=out)
+    figures = run_export(small_demo, products=["texture"], formats=formats, out=out).to_json()
     assert 0.5 < figures["textured"] <= 1
     mesh = read_mesh(out / "mesh" / "mesh.ply")
     # A GLB is turned upright.

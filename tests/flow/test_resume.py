@@ -47,7 +47,7 @@ def test_an_interrupted_run_goes_on_to_the_same_files_in_any_number_of_threads(
         assert [path.name for path in tmp_path.iterdir()] == [".partial"]
     run = _run(drive, tmp_path, resume=True, threads=2)
     assert content(tmp_path) == unbroken
-    assert run.summary["frames"] == FRAMES
+    assert run.summary.to_json()["frames"] == FRAMES
     assert not (tmp_path / ".partial").exists()
 
 

@@ -53,7 +53,7 @@ def test_measured_lengths_show_the_baseline(street, wider, how):
     assert used.calibration.baseline_m == pytest.approx(camera.baseline_m, rel=3.0 * seen.sigma)
     assert used.refined == bool(used.warnings()) == bool(only_said.warnings()) == bool(seen.ratio)
     assert bool(seen.ratio) or wider == 1.0
-    assert used.figures()["baseline"]["percent"] == pytest.approx(100.0 * seen.ratio)
+    assert used.figures().to_json()["baseline"]["percent"] == pytest.approx(100.0 * seen.ratio)
     raw = seen.applied(as_raw(given))
     assert raw.T_right_left[0, 3] == pytest.approx(-given.baseline_m * (1.0 + seen.ratio))
 

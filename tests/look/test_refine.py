@@ -71,7 +71,7 @@ def test_a_turned_right_camera_is_recovered_and_said(street, yaw_deg, enlarged):
     assert abs(left.mean_px) < 3.0 * rig.sigma_px
     assert rig.wrong_at(10.0)
     assert not rig.wrong_at(0.5)
-    figures = json.loads(json.dumps(rig.figures(), allow_nan=False))
+    figures = json.loads(json.dumps(rig.figures().to_json(), allow_nan=False))
     assert figures["yaw_deg"] == pytest.approx(-yaw_deg, abs=0.065)
     # Lenses can share a focal length; what they see together is asked above.
     assert figures["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.15)
@@ -92,7 +92,7 @@ def test_a_turned_right_camera_is_recovered_and_said(street, yaw_deg, enlarged):
         assert again.applied(later).calibration is rig.calibration
         anew = {"frames": None, "sigma": None, "seconds": None}
         begun = {"begun_with": "session 0 (film)", "right_time_offset": anew}
-        assert again.figures() == {**figures, **begun}
+        assert again.figures().to_json() == {**figures, **begun}
         assert "session 0 (film) showed" in again.warnings()[0]
     assert not refine_rig(source, CONFIG, RigSettings(refine=False), known).refined
 
@@ -108,7 +108,7 @@ def test_a_drive_that_arrives_shows_its_rig_by_every_second_part_of_it(street):
     assert rig.fitted.windows == len(tracks.windows) == MIN_WINDOWS
     assert np.degrees(rig.fitted.values[1]) == pytest.approx(-0.25, abs=0.1)
     few = rig_shown(tracks.windows[1:], source.calibration, CONFIG.rectification)
-    assert (few.refined, few.figures()) == (False, {"refined": False})
+    assert (few.refined, few.figures().to_json()) == (False, {"refined": False})
     # A long drive is as few parts as a short one; where it is lost, nothing is seen.
     for n in range(2 * FRAMES, 10 * FRAMES):
         tracks.add(n, there[0], lost)
@@ -133,7 +133,7 @@ def test_cameras_that_are_not_in_step_do_not_look_turned():
     )
     assert rig.fitted.time_offset == pytest.approx(0.5, rel=0.2)
     # Without the time the yaw would be -0.3°, and disparities 7.6 px off.
-    assert abs(rig.figures()["yaw_deg"]) < 0.1
+    assert abs(rig.figures().to_json()["yaw_deg"]) < 0.1
     assert off(slow.calibration, rig.calibration).rms_px < 0.8
     (line,) = (line for line in rig.warnings() if "after the left" in line)
     assert rig.warnings([line]) == [one for one in rig.warnings() if one != line]
@@ -144,7 +144,7 @@ def test_stabilised_images_are_said_of_the_drive_that_has_them(street):
     rig = replace(rig, fitted=replace(rig.fitted, fixed=False))
     (line,) = rig.warnings()
     assert "stabilised" in line
-    assert rig.figures()["fixed"] is False
+    assert rig.figures().to_json()["fixed"] is False
     known = KnownRig(rig.given, rig.calibration, rig.fitted, "first")
     assert known.begun(CONFIG.rectification).warnings() == []
 
@@ -165,7 +165,7 @@ def test_what_is_not_to_be_refined_is_read_once_and_not_matched(street, *, short
     source = SourcePart(source, 1, FRAMES) if short else source
     source = LiveSource(source) if live else source
     rig = refine_rig(source, CONFIG, RigSettings(refine=refine))
-    assert (rig.refined, rig.fitted, rig.figures()) == (False, None, {"refined": False})
+    assert (rig.refined, rig.fitted, rig.figures().to_json()) == (False, None, {"refined": False})
     assert (rig.warnings(), rig.wrong_at(10.0)) == ([], False)
     assert rig.applied(source) is source
     assert len(read) == len(set(read)) == (0 if live else len(source))
@@ -176,7 +176,7 @@ def test_a_drive_that_shows_nothing_keeps_its_calibration(street, drive):
     black = street.taken(slice(None), np.zeros_like)
     still = Film(FRAMES * street.pairs[:1], street.calibration, street.trajectory.T_world_camera)
     rig = refine_rig({"black": black, "standing still": still}[drive], CONFIG, AUTO)
-    assert (rig.refined, rig.figures()) == (False, {"refined": False})
+    assert (rig.refined, rig.figures().to_json()) == (False, {"refined": False})
 
 
 @pytest.mark.slow
@@ -204,7 +204,9 @@ def test_depth_behind_infinity_is_said_and_can_be_stored(street):
     fitted = refine_rig(street, CONFIG, AUTO).fitted
     rig = RefinedRig(camera, true, camera, fitted, changes=changes, sigma_px=0.1)
     assert rig.depth_percent(changes[1]) == (np.inf, np.inf)
-    assert json.loads(json.dumps(rig.figures(), allow_nan=False))["depth_percent"]["30"] == {
+    assert json.loads(json.dumps(rig.figures().to_json(), allow_nan=False))["depth_percent"][
+        "30"
+    ] == {
         "mean": None,
         "sigma": None,
     }

@@ -228,7 +228,7 @@ def test_a_drive_is_mapped_with_a_plugin_and_results_name_it(tmp_path):
     ]).street)  # fmt: skip
     options = recon.MapOptions(audit=False, out=tmp_path / "run", mesh=False)
     config = recon.load_config(overrides=["rig.refine=false", "odometry.method=ahead"])
-    assert recon.run_map(source, config, options).summary["odometry"] == "ahead"
+    assert recon.run_map(source, config, options).summary.to_json()["odometry"] == "ahead"
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["odometry"] == "ahead"
     assert "method: ahead" in (tmp_path / "run" / "config.yaml").read_text()
     bad = recon.MapOptions(audit=False, out=tmp_path / "bad", mesh=False)

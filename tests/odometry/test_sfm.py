@@ -62,7 +62,7 @@ def test_pairs_in_no_order_get_metric_poses_and_black_ones_none(found, street):
     assert scaled.scale == pytest.approx(1.0, abs=0.01)
     assert (model.sigmas > 0).all()
     assert model.sigmas[:, 0].max() < 0.06
-    assert found.figures()["registered"] == 9
+    assert found.figures().to_json()["registered"] == 9
     assert found.warnings()[0].startswith("2 of 11 pairs could not be placed")
 
 
@@ -86,10 +86,10 @@ def test_photos_become_a_map_whose_first_warning_names_what_is_missing(photos, f
     config = load_config(None, ["odometry.method=sfm", "rig.refine=off"])
     run = run_map(photos, config, MapOptions(out=tmp_path / "run", mesh=False, audit=False))
     assert run.warnings[0] == found.warnings()[0]
-    assert run.summary["sfm"]["models"] == [9]
-    assert (run.summary["frames"], run.summary["frames_not_trusted"]) == (11, 2)
+    assert run.summary.to_json()["sfm"]["models"] == [9]
+    assert (run.summary.to_json()["frames"], run.summary.to_json()["frames_not_trusted"]) == (11, 2)
     assert run.mapped.session.odometry.T_world_camera[1] == pytest.approx(np.eye(4))
-    assert run.summary["camera_height_m"] == pytest.approx(1.65, abs=0.15)
+    assert run.summary.to_json()["camera_height_m"] == pytest.approx(1.65, abs=0.15)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
 
 
@@ -110,7 +110,10 @@ def test_a_run_that_is_resumed_does_not_look_for_poses_again(tmp_path, monkeypat
     assert not [*(tmp_path / "run").rglob("sfm-*")]
     monkeypatch.setattr("recon.map.drive.sequence.find_poses", None)
     run = run_map(open_source(drive), config, replace(options, resume=True))
-    assert (run.summary["sfm"]["registered"], run.summary["frames_not_trusted"]) == (6, 0)
+    assert (
+        run.summary.to_json()["sfm"]["registered"],
+        run.summary.to_json()["frames_not_trusted"],
+    ) == (6, 0)
 
 
 def test_two_places_in_one_folder_are_two_models(street):

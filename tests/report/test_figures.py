@@ -45,6 +45,7 @@ from recon.report.batch_page import sweep_figure
 from recon.report.page import page_environment, timing_figure
 from recon.run.batch.job import Job, Outcome
 from recon.run.batch.results import JobResult
+from tests.scenery.calibrated import GOOD
 
 
 def picture(png: bytes) -> UInt8:
@@ -366,7 +367,7 @@ def test_each_view_of_a_calibration_has_its_error_and_corners(drawn):
         fit=fit,
         seen=SimpleNamespace(size_px=(80, 60)),
         epipolar_error_px=np.linspace(-1, 1, 101),
-        summary={"coverage_left": 0.5, "coverage_right": 0.75},
+        summary=replace(GOOD, coverage_left=0.5, coverage_right=0.75),
     )
     calibration_page.errors_figure(result)
     calibration_page.coverage_figure(result)

@@ -44,11 +44,11 @@ def codes(source: StereoSource, *, quick: bool = False) -> set[str]:
 def test_a_clean_drive_is_good_and_its_figures_are_right(street):
     audit = audit_source(street, CONFIG)
     assert (audit.verdict, audit.findings) == ("good", ())
-    assert audit.figures["gain"] == pytest.approx(1, abs=0.02)
-    assert audit.figures["epipolar_error_rms_px"] < 0.1
+    assert audit.figures.to_json()["gain"] == pytest.approx(1, abs=0.02)
+    assert audit.figures.to_json()["epipolar_error_rms_px"] < 0.1
     # 1 m a frame, ten frames a second.
-    assert audit.figures["speed_m_per_s"] == pytest.approx(10, rel=0.05)
-    assert audit.figures["frames_read"] == FRAMES
+    assert audit.figures.to_json()["speed_m_per_s"] == pytest.approx(10, rel=0.05)
+    assert audit.figures.to_json()["frames_read"] == FRAMES
     assert audit_source(street, CONFIG, quick=True).verdict == "good"
 
 
@@ -102,11 +102,14 @@ def assert_aligned(spoiled: faults.Spoiled, folder: Path) -> None:
     assert repaired.baseline_m == pytest.approx(spoiled.camera.baseline_m, rel=1e-9)
     after = audit_source(replace(spoiled, camera=repaired), CONFIG)
     assert "rows" not in {finding.code for finding in after.findings}
-    assert abs(after.figures["epipolar_error_mean_px"]) < 0.3
-    assert after.figures["epipolar_error_rms_px"] < 0.3
-    assert before.figures["epipolar_error_rms_px"] > 5 * after.figures["epipolar_error_rms_px"]
+    assert abs(after.figures.to_json()["epipolar_error_mean_px"]) < 0.3
+    assert after.figures.to_json()["epipolar_error_rms_px"] < 0.3
+    assert (
+        before.figures.to_json()["epipolar_error_rms_px"]
+        > 5 * after.figures.to_json()["epipolar_error_rms_px"]
+    )
     # Mending what is repaired changes next to nothing.
-    assert abs(after.figures["repair_pitch_deg"]) < 0.02
+    assert abs(after.figures.to_json()["repair_pitch_deg"]) < 0.02
 
 
 def test_a_rig_that_is_not_rectified_is_corrected_too(street, tmp_path):
@@ -144,13 +147,13 @@ def test_a_turn_that_only_motion_shows_is_mended(
     spoiled = faults.turned(longer_street, pitch_deg, yaw_deg=yaw_deg, enlarged=enlarged)
     before = audit_source(spoiled, CONFIG)
     assert "rig" in {finding.code for finding in before.findings}
-    found = correct_calibration(spoiled, CONFIG, before, tmp_path / "repaired.yaml")
+    found = correct_calibration(spoiled, CONFIG, before, tmp_path / "repaired.yaml").to_json()
     assert found["yaw_deg"] == pytest.approx(-yaw_deg, rel=0.25)
     assert found["focal_percent"] == pytest.approx(100 * (enlarged - 1), abs=0.15)
     repaired = read_calibration(tmp_path / "repaired.yaml", 400, 136)
     after = audit_source(replace(spoiled, camera=repaired), CONFIG)
     assert after.findings == ()
-    assert after.figures["rig_by_motion"]["disparity_px"]["rms"] < 0.1
+    assert after.figures.to_json()["rig_by_motion"]["disparity_px"]["rms"] < 0.1
 
 
 @pytest.mark.real
@@ -177,7 +180,10 @@ def test_nothing_is_found_on_scenes_of_one_pair(recon_data, scene):
 def test_a_turn_planted_in_a_real_drive_is_found(recon_data):
     source = open_source(recon_data / "driven" / "kitti_raw_0013")
     drives_ = (source, faults.turned(source, yaw_deg=0.06))
-    yaw_deg = [audit_source(drive, CONFIG).figures["rig_by_motion"]["yaw_deg"] for drive in drives_]
+    yaw_deg = [
+        audit_source(drive, CONFIG).figures.to_json()["rig_by_motion"]["yaw_deg"]
+        for drive in drives_
+    ]
     assert yaw_deg[1] - yaw_deg[0] == pytest.approx(-0.06, rel=0.2)
 
 
@@ -213,7 +219,7 @@ def test_cameras_that_are_late_or_hang_are_measured_and_a_black_image_is_neither
         return replace(pair, right=np.zeros_like(pair.right)) if index == 4 else pair
 
     audit = audit_source(faults.Spoiled(street.camera, FRAMES // 2, half_late), CONFIG)
-    assert audit.figures["time_skew_frames"] == pytest.approx(0.5, abs=0.1)
+    assert audit.figures.to_json()["time_skew_frames"] == pytest.approx(0.5, abs=0.1)
     assert "skew" in {finding.code for finding in audit.findings}
     findings = audit_source(replace(street, take=frozen), CONFIG).findings
     (hung,) = (finding for finding in findings if finding.code == "frozen")
@@ -221,5 +227,5 @@ def test_cameras_that_are_late_or_hang_are_measured_and_a_black_image_is_neither
     assert "the right camera is frozen for 5 frames" in hung.text
     assert "black" not in codes(replace(street, take=once_black))
     alone = audit_source(replace(street, count=1), CONFIG)
-    assert (alone.verdict, alone.figures["frames_read"]) == ("good", 1)
-    assert alone.figures["epipolar_error_rms_px"] < 0.2
+    assert (alone.verdict, alone.figures.to_json()["frames_read"]) == ("good", 1)
+    assert alone.figures.to_json()["epipolar_error_rms_px"] < 0.2

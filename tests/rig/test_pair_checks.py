@@ -95,7 +95,7 @@ def test_the_same_image_twice_is_refused_as_such(pair, tmp_path):
 def test_a_calibration_that_gives_a_cloud_of_wrong_size_is_warned_of(pair, tmp_path, camera, word):
     run_ = run(pair, tmp_path / "pair", camera, "pair")
     assert any(word in line for line in run_.warnings)
-    assert run_.summary["warnings"] == list(run_.warnings)
+    assert run_.summary.to_json()["warnings"] == list(run_.warnings)
     # Nobody asked for depth here.
     assert run(pair, tmp_path / "disparity", camera).warnings == ()
 
@@ -105,14 +105,16 @@ def test_the_run_of_a_pair_is_meshed_again_as_the_pair_was(good_run, tmp_path):
     told = list(dict.fromkeys(stages))  # as they begin
     assert told == ["audit", "match", "mesh", "write", "report", "hash"]
     # One plane: all but a rim of two pixels.
-    assert 0.95 < first.summary["mesh_coverage"] <= 1
+    assert 0.95 < first.summary.to_json()["mesh_coverage"] <= 1
     assert not [text for text in first.warnings if "mesh" in text]
     assert check_coverage(0.8) == ()
     (warning,) = check_coverage(0.003)
     assert "covers 0.3 % of the cloud (points within 0.5 % of their depth)" in warning
     assert (folder / "mesh" / "mesh.glb").is_file()
-    again = run_mesh(folder, SETTINGS, out=tmp_path / "again", formats=("glb", "obj"))
-    assert again["mesh_coverage"] == pytest.approx(first.summary["mesh_coverage"], abs=1e-3)
+    again = run_mesh(folder, SETTINGS, out=tmp_path / "again", formats=("glb", "obj")).to_json()
+    assert again["mesh_coverage"] == pytest.approx(
+        first.summary.to_json()["mesh_coverage"], abs=1e-3
+    )
     for name in ("mesh.ply", "mesh.glb"):
         files = [run / "mesh" / name for run in (folder, tmp_path / "again")]
         assert files[0].read_bytes() == files[1].read_bytes()

@@ -7,7 +7,6 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -15,7 +14,7 @@ import yaml
 from recon.core.errors import FormatError, OutputError
 from recon.core.progress import Silent, showing
 from recon.core.settings import Settings
-from recon.core.text import to_json
+from recon.core.summary import RunSummary, to_json
 from recon.io.atomic import exchange
 from recon.io.files import fingerprint, refuse_links
 from recon.run import directory
@@ -25,6 +24,11 @@ from recon.run.run import Run, WholeRun
 
 class _Size(Settings):
     voxel_m: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Found(RunSummary):
+    points: int
 
 
 class _Notes(Silent):
@@ -40,24 +44,25 @@ def test_a_run_writes_configuration_summary_and_record(tmp_path, monkeypatch):
     photo.write_bytes(b"pixels")
     monkeypatch.setattr("recon.run.run.peak_memory_mb", lambda: next(peak_mb))
     notes = _Notes()
-    summary: dict[str, Any] = {"points": 3, "warnings": ["few points"]}
+    found = _Found(points=3, warnings=["few points"])
     with showing(notes), Run("pair", out, _Size(), threads=1) as run:
         for _ in range(2):
             with run.stage("match"):
                 time.sleep(0.01)
-        with run.report(summary):
+        with run.report(found) as costed:
             assert yaml.safe_load(run.path("config.yaml").read_text()) == {"voxel_m": 0.1}
-            shown = dict(summary)
+            shown = costed.to_json()
             run.path("report.html").write_text("<p>")
         with pytest.raises(ValueError, match="JSON"):
             run.write_json("figures.json", {"t_rel_percent": math.nan})
-        run.finish(summary, source="im0", inputs=[photo], record={"mapped_by": "demo"})
+        done = run.finish(found, source="im0", inputs=[photo], record={"mapped_by": "demo"})
+        summary = done.to_json()
 
     assert notes.stages == ["match", "match", "report", "hash"]
     assert json.loads((out / "summary.json").read_text()) == summary
     assert summary["out"] == str(out)
     cost = ("seconds", "stages", "peak_memory_mb")
-    assert list(shown) == ["points", "warnings", *cost]
+    assert set(shown) == {"points", "warnings", *cost}
     assert shown == {**{key: summary[key] for key in cost}, "points": 3, "warnings": ["few points"]}
     assert list(shown["stages"]) == ["match"]
     assert 60 > shown["seconds"] >= shown["stages"]["match"] >= 0.02
@@ -81,7 +86,7 @@ def test_a_run_in_the_default_folder_gets_a_link_and_writes_no_configuration_tha
     monkeypatch.chdir(tmp_path)
     for _ in range(2):
         with Run("map") as run:
-            run.finish({}, source="drive", inputs=[])
+            run.finish(RunSummary(), source="drive", inputs=[])
     runs = tmp_path / "outputs" / "map"
     stamps = sorted(path for path in runs.iterdir() if not path.is_symlink())
     assert len(stamps) == 2

@@ -49,7 +49,7 @@ def test_a_subclass_is_mapped_and_has_defaults_for_the_rest(own):
     assert repr(own) == "Own(Own, pairs: 3, a source)"
     assert (own.files, own.truth, own.stamps_s, own.left_out) == ((), None, None, 0)
     assert (own.live, own.lead, own.hurried()) == (False, 0, False)
-    assert (own.warnings(), own.figures()) == ([], {})
+    assert (own.warnings(), own.figures().to_json()) == ([], {})
     assert [own.lines(count) for count in (2, 3, 4)] == [None, [0, 1, 2], [0, 1, 2]]
 
 
@@ -157,7 +157,7 @@ def test_who_keeps_up_gets_every_pair():
     begun = time.perf_counter()
     pairs = list(live)
     assert time.perf_counter() - begun >= 0.25  # five gaps of 50 ms
-    figures = live.figures()["live"]
+    figures = live.figures().to_json()["live"]
     assert [pair.index for pair in pairs] == [0, 1, 2, 3, 4, 5][-len(pairs) :]
     assert figures["frames_arrived"] == 6
     assert len(pairs) + figures["frames_dropped"] == 6
@@ -177,7 +177,7 @@ def test_who_is_slow_gets_the_newest_and_is_told_what_was_dropped():
     assert [pair.index for pair in (first, *rest)] == [0, 9]
     assert not live.hurried()
     live.note_unmatched()
-    figures = live.figures()["live"]
+    figures = live.figures().to_json()["live"]
     counts = [figures[f"frames_{what}"] for what in ("arrived", "dropped", "not_matched")]
     assert counts == [10, 8, 1]
     assert [text.split()[0] for text in live.warnings()] == ["1", "8"]
@@ -185,12 +185,12 @@ def test_who_is_slow_gets_the_newest_and_is_told_what_was_dropped():
 
 def test_the_time_from_arrival_to_result_is_measured_of_drives_that_are_played():
     live = LiveSource(Recording(1))
-    assert live.figures()["live"]["latency_ms"] == {"p50": None, "p95": None, "max": None}
+    assert live.figures().to_json()["live"]["latency_ms"] == {"p50": None, "p95": None, "max": None}
     assert live.warnings() == []
     for _ in live:
         time.sleep(0.02)
         live.note_located(0)
-    latency_ms = live.figures()["live"]["latency_ms"]
+    latency_ms = live.figures().to_json()["live"]["latency_ms"]
     assert 20 <= latency_ms["p50"] <= latency_ms["p95"] <= latency_ms["max"]
 
 

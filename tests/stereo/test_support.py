@@ -129,7 +129,7 @@ def test_a_plain_wall_below_a_textured_strip_is_warned_of_and_not_invented():
     ratios = found.disparity.reason_ratios
     assert ratios[Reason.VALID] < 0.25
     assert ratios.get(Reason.FILLED, 0.0) < 0.02
-    assert found.summary["valid_percent"] == pytest.approx(100 * ratios[Reason.VALID])
+    assert found.summary.to_json()["valid_percent"] == pytest.approx(100 * ratios[Reason.VALID])
     (warning,) = (text for text in found.warnings if "of the pixels were measured" in text)
     assert "need more light, or texture" in warning
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from recon.core.errors import FormatError, SettingsError, SourceError
 from recon.core.plugins import name_of
-from recon.core.text import counted, to_json
+from recon.core.summary import Rows, RunSummary, optional
+from recon.core.text import counted
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Float32
 from recon.evaluation.middlebury.score import (
@@ -39,6 +40,7 @@ from recon.io.middlebury import (
     stand_in_camera,
 )
 from recon.stereo.frame import StereoSettings
+from recon.stereo.match.onnx import NetworkFigures
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import check_matcher, make_matcher, searched_ndisp
 from recon.stereo.rectify.rectifier import Rectifier
@@ -167,13 +169,53 @@ class SceneDone:
         return self.name if self.figures is not None else f"{self.name}: no truth"
 
 
+_MOST_ROWS: Final = 3  # matchers that the terminal names, each in a line
+
+
+def _scores(found: Figures) -> str:
+    """Return the errors of a matcher in the terms of the benchmark's table."""
+    return f"bad 2.0 {found['bad']['2']:.1f} %, avgerr {found['avgerr']:.2f} px (nonocc, dense)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MiddleburySummary(RunSummary):
+    """Scores of matchers and of other programs on scenes, by the rules of the benchmark.
+
+    Of each of the ``matchers``, ``scenes`` has the figures by scene, and ``weighted`` their mean.
+    """
+
+    matchers: Mapping[str, Figures]
+    folder: str
+    results: Mapping[str, str]  # folders of the results of other programs
+    mean_over: Sequence[str]  # scenes that all have a result for
+    skipped: Sequence[str]  # scenes without ground truth
+    threads: int = 1
+    parallel: int = 1  # scenes that were processed at once
+    network: NetworkFigures | None = optional()
+
+    def rows(self) -> Rows:
+        best = [
+            (name, _scores(found["weighted"]["nonocc"]["dense"]))
+            for name, found in self.matchers.items()
+        ]
+        shown, others = best[:_MOST_ROWS], ", ".join(name for name, _ in best[_MOST_ROWS:])
+        return [
+            (f"{', '.join(self.matchers)} on {counted(len(self.mean_over), 'scene')}",),
+            *self.folder_row(),
+            *shown,
+            *([("and", f"{others} (--verbose has all)")] if others else []),
+            *self.cost_row(),
+            ("next", self.open_report()),
+        ]
+
+
 def summarise_scenes(
     found: Mapping[str, SceneFigures | None],
     names: Sequence[str],
     results: Sequence[ResultFolder],
     folder: Path,
-) -> Figures:
-    """Return the content of ``summary.json``; means are over the scenes that all have."""
+) -> MiddleburySummary:
+    """Return the figures of all scenes; means are over the scenes that all have."""
     skipped = [name for name, figures in found.items() if figures is None]
     scenes = {name: figures for name, figures in found.items() if figures is not None}
     if not scenes:
@@ -191,15 +233,14 @@ def summarise_scenes(
             over = f"{len(common)} of {counted(len(scenes), 'scene')}"
             missing = f"no result for {', '.join(lacking)}"
             warnings.append(f"{result.name}: {missing}; means are over {over}, which all have")
-    summary = {
-        "matchers": {name: _of_matcher(scenes, name, common) for name in names},
-        "folder": str(folder),
-        "results": {result.name: str(result.folder) for result in results},
-        "mean_over": common,
-        "skipped": skipped,
-        "warnings": warnings,
-    }
-    return dict(to_json(summary))
+    return MiddleburySummary(
+        matchers={name: _of_matcher(scenes, name, common) for name in names},
+        folder=str(folder),
+        results={result.name: str(result.folder) for result in results},
+        mean_over=common,
+        skipped=skipped,
+        warnings=warnings,
+    )
 
 
 def _of_matcher(scenes: Mapping[str, SceneFigures], matcher: str, common: Sequence[str]) -> Figures:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from recon.core.geometry.se3 import apply, rotate
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.machine import available_cores
 from recon.core.progress import tracked
+from recon.core.summary import optional
 from recon.core.text import counted
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Float32, Int32, Int64
@@ -46,6 +47,9 @@ from recon.map.occupancy.moving import looked_through
 from recon.map.sessions.placed import has_occupancy
 from recon.map.tiles import Tiles
 
+pass
+from recon.export.product import ProductFigures
+
 WHOLE: Final = "mesh/mesh.ply"
 LAYER: Final = "mesh/cloud.ply"  # of the MeshLab project, where there is no other cloud
 SAMPLE_FACES: Final = 2_000_000  # most triangles of a mesh that is loaded whole for images
@@ -55,6 +59,31 @@ _SIDES: Final = ((0, 0), (0, 1), (1, 0), (1, 1))  # of a piece: axis, 1 for the 
 _SEAM_M: Final = 0.15  # widest gap that is closed where two pieces meet
 _BULGE_M: Final = 2.0  # how far a surface may go beyond the points that it is made of
 PieceKey = tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MeshFigures(ProductFigures):
+    """The surface of a map; without points there is none."""
+
+    points: int | None = optional()  # of the cloud that it is made of
+    vertices: int | None = optional()
+    faces: int = 0
+    tiles: int | None = optional()  # pieces that it was made in
+    mesh_offset_m: Sequence[float] | None = optional()  # to be added for survey coordinates
+    mesh_coverage: float | None = optional()  # fraction of the measured points on it, of a pair
+
+    @property
+    def text(self) -> str:
+        covered = self.mesh_coverage
+        on = "" if covered is None else f", on it {100 * covered:.0f} % of the measured points"
+        return f"{self.faces:,} faces{on}"
+
+
+class MadeMesh(NamedTuple):
+    """What is left of a surface that was written."""
+
+    figures: MeshFigures
+    warnings: Sequence[str]
 
 
 class MeshPiece(NamedTuple):
@@ -91,16 +120,17 @@ def mesh_product(context: ExportContext, path: Path) -> ExportResult:
     warnings = [*made.warnings]
     if context.mesh.free_space and not has_occupancy(context.map):
         warnings.append("the map kept no rays: which faces lie in free space is not known")
-    small = made.figures["faces"] <= SAMPLE_FACES
+    small = made.figures.faces <= SAMPLE_FACES
     mesh = read_mesh(path) if small or context.survey is not None else None
     survey = path.with_name("survey")
-    there = {} if mesh is None else write_surveyed(context, mesh, survey, context.formats)
-    return ExportResult({**made.figures, **there}, warnings, mesh if small else None)
+    offset_m = None if mesh is None else write_surveyed(context, mesh, survey, context.formats)
+    figures = replace(made.figures, mesh_offset_m=offset_m)
+    return ExportResult(figures, warnings, mesh if small else None)
 
 
 def export_mesh(
     tiles: Tiles, settings: MeshSettings, path: Path, cloud: Path, threads: int | None = None
-) -> ExportResult:
+) -> MadeMesh:
     """Write the surface of a map, its pieces if there are several, and a MeshLab project.
 
     Args:
@@ -124,8 +154,8 @@ def export_mesh(
         layers = {"mesh": path}
     write_mlp(path.with_suffix(".mlp"), {**layers, "cloud": cloud}, "map")
     vertices, faces = (sum(numbers) for numbers in [*zip(*pieces, strict=True)][1:])
-    figures = {"points": points.total(), "vertices": vertices, "faces": faces}
-    return ExportResult({**figures, "tiles": len(pieces)}, warnings)
+    figures = MeshFigures(points=points.total(), vertices=vertices, faces=faces, tiles=len(pieces))
+    return MadeMesh(figures, warnings)
 
 
 def _count(tiles: Tiles, settings: MeshSettings) -> Counter[PieceKey]:
@@ -272,15 +302,15 @@ _ROUND_M: Final = 100.0
 
 def write_surveyed(
     context: ExportContext, mesh: TriangleMesh, folder: Path, formats: Sequence[str]
-) -> dict[str, Any]:
-    """Write a mesh, map axes, once more into a folder; return its figures.
+) -> Sequence[float] | None:
+    """Write a mesh, map axes, once more into a folder; return what is to be added, metres.
 
     Its axes are east, north and up. ``offset.xyz`` has what is to be added to its coordinates:
     hundreds of metres to the east and north; ``mesh.prj`` the coordinate system, if it is known.
     Without a survey nothing is written.
     """
     if context.survey is None:
-        return {}
+        return None
     T_survey_map = context.T_survey_map
     offset_m = np.array([*(np.floor(T_survey_map[:2, 3] / _ROUND_M) * _ROUND_M), 0.0])
     T_mesh_map = T_survey_map.copy()
@@ -298,4 +328,4 @@ def write_surveyed(
     if context.crs is not None:
         wkt = check_crs(context.crs).to_wkt("WKT1_ESRI")
         write_text(folder / "mesh.prj", f"{wkt}\n")
-    return {"mesh_offset_m": offset_m.tolist()}
+    return list(offset_m.tolist())

@@ -14,7 +14,7 @@ Graphics 32(4), 2008 (weights instead of seams).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -27,6 +27,7 @@ from scipy.spatial import cKDTree
 from recon.core.errors import MeshingError
 from recon.core.geometry.se3 import apply, invert
 from recon.core.open3d_raycasting import RayScene
+from recon.core.summary import optional
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Texture, TriangleMesh
 from recon.core.values.arrays import Float32, Float64, Int32, Int64, UInt8
@@ -39,6 +40,9 @@ from recon.io.images.image import write_image
 from recon.io.models.mesh import Photo, read_mesh, write_mesh, write_mlp
 from recon.map.fusion import fusion_range_m
 from recon.map.sessions.placed import settings_of
+
+pass
+from recon.export.product import ProductFigures
 
 _WITH_TEXTURE: Final = ("glb", "obj", "ply")
 _VIEWS: Final = 3  # images that a vertex takes its colour from
@@ -67,6 +71,20 @@ Views = Callable[[], Iterable[PosedImage]]
 """Gives the same images again each time it is called, one in memory at a time."""
 
 
+@dataclass(frozen=True)
+class TextureFigures(ProductFigures):
+    """The picture on a surface."""
+
+    texture_px: int  # its larger side
+    texel_m: float
+    textured: float  # fraction of the faces that an image sees
+    mesh_offset_m: Sequence[float] | None = optional()  # to be added for survey coordinates
+
+    @property
+    def text(self) -> str:
+        return f"{self.texture_px} px, {100 * self.textured:.0f} % of the faces seen"
+
+
 def texture_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the surface and its picture, and beside it a MeshLab project with the keyframes.
 
@@ -90,13 +108,14 @@ def texture_product(context: ExportContext, path: Path) -> ExportResult:
         write_mesh(path.with_suffix(f".{suffix}"), textured, "map")
     photos = [*_photos(path.with_name("images"), drives)]
     write_mlp(path.with_suffix(".mlp"), {"mesh": whole}, "map", photos)
-    there = write_surveyed(context, textured, path.with_name("survey"), named)
-    return ExportResult({**figures, **there}, () if made is None else made.warnings)
+    offset_m = write_surveyed(context, textured, path.with_name("survey"), named)
+    figures = replace(figures, mesh_offset_m=offset_m)
+    return ExportResult(figures, () if made is None else made.warnings)
 
 
 def textured_mesh(
     mesh: TriangleMesh, views: Views, edge_m: float, range_m: float, most_px: int
-) -> tuple[TriangleMesh, dict[str, float]]:
+) -> tuple[TriangleMesh, TextureFigures]:
     """Return a mesh in charts whose picture is painted by images; and figures of it.
 
     Args:
@@ -121,12 +140,8 @@ def textured_mesh(
     uv = (atlas.places / [atlas.width_px, atlas.height_px]).astype(np.float32)
     # Colours of vertices would darken the picture in some viewers.
     textured = replace(atlas.mesh, rgb=None, texture=Texture(picture, uv))
-    figures = {
-        "texture_px": max(atlas.width_px, atlas.height_px),
-        "texel_m": atlas.texel_m,
-        "textured": float(seen.mean()),
-    }
-    return textured, figures
+    size_px = max(atlas.width_px, atlas.height_px)
+    return textured, TextureFigures(size_px, atlas.texel_m, float(seen.mean()))
 
 
 def posed_images(drives: Sequence[DriveImages]) -> Iterator[PosedImage]:

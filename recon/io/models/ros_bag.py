@@ -42,8 +42,9 @@ class RosBag:
         """Write a message; ``kept`` = who subscribes late gets the last one of the topic, too."""
         kind, fields = message
         if topic not in self._topics:
-            how: Any = {"typestore": self._store, "offered_qos_profiles": self._quality(kept)}
-            self._topics[topic] = self._writer.add_connection(topic, kind, **how)
+            self._topics[topic] = self._writer.add_connection(
+                topic, kind, typestore=self._store, offered_qos_profiles=self._quality(kept)
+            )
         content = self._store.serialize_cdr(self._made(kind, fields), kind)
         self._writer.write(self._topics[topic], time_ns, content)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
@@ -11,13 +11,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.summary import Figures
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Float64
 from recon.core.work import Stopwatch
 from recon.map.store.session import Keyframes
 from recon.odometry.protocol import OdometryHealth
-from recon.places.adjustment import Adjustment, adjust_path
+from recon.places.adjustment import Adjustment, AdjustmentFigures, adjust_path
 from recon.places.closure import Closure, DrivePath, close_loops
 from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.places.places import path_lengths
@@ -25,6 +26,20 @@ from recon.stereo.frame import ReconstructedFrame
 
 _TELLING: Final = 3  # implausible place recognitions from which a warning is given
 _BEHIND: Final = 4  # frames by which loop detection may lag behind
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoopFigures(Figures):
+    """How many loops of a drive were found and closed, and what that moved."""
+
+    keyframes: int
+    found: int  # that passed the geometric check
+    unconfirmed: int  # of these, without a neighbour that agrees
+    closed: int
+    refused_by_graph: int
+    refused: Mapping[str, int]  # candidates, by reason
+    largest_correction_m: float
+    adjusted: AdjustmentFigures | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,17 +63,18 @@ class DriveLoops:
         moved = self.closure.trajectory.positions_m - self.odometry.positions_m
         return np.asarray(np.linalg.norm(moved, axis=1))
 
-    def figures(self) -> dict[str, Any]:
-        return {
-            "keyframes": self.keyframes,
-            "found": self.found,
-            "unconfirmed": self.found - len(self.closure.closed) - len(self.closure.refused),
-            "closed": len(self.closure.closed),
-            "refused_by_graph": len(self.closure.refused),
-            "refused": dict(sorted(self.refused.items())),
-            "largest_correction_m": float(self.corrections_m.max(initial=0.0)),
-            "adjusted": None if self.adjustment is None else self.adjustment.figures(),
-        }
+    def figures(self) -> LoopFigures:
+        closed, refused = len(self.closure.closed), len(self.closure.refused)
+        return LoopFigures(
+            keyframes=self.keyframes,
+            found=self.found,
+            unconfirmed=self.found - closed - refused,
+            closed=closed,
+            refused_by_graph=refused,
+            refused=dict(sorted(self.refused.items())),
+            largest_correction_m=float(self.corrections_m.max(initial=0.0)),
+            adjusted=None if self.adjustment is None else self.adjustment.figures(),
+        )
 
     def record(self) -> dict[str, Any]:
         """Return what a map keeps of it: the loops, and the path after closure if any closed."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -229,8 +229,13 @@ def map_sequence(
     else:
         odometry = odometry_of(config, source, known_poses, prior, used, guide)
     looking = config.loops.enabled and known_poses is None and not by_sfm
-    how: Any = {"search": looking, "scale": config.scale}
-    watch = LoopWatch(session.keyframes, reconstructor.camera, work.stopwatch, **how)
+    watch = LoopWatch(
+        session.keyframes,
+        reconstructor.camera,
+        work.stopwatch,
+        search=looking,
+        scale=config.scale,
+    )
     up = None if guide is None else guide.up
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch, up)
     checked = odometry.odometry if isinstance(odometry, CheckedOdometry) else None

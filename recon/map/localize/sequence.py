@@ -5,24 +5,26 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from recon.core.errors import MappingError, RegistrationError
 from recon.core.progress import series, stage
-from recon.core.text import counted
+from recon.core.summary import Figures, Rows, RunSummary, inline, shown_path
+from recon.core.text import counted, metres
 from recon.core.values import OccupancyGrid, Recorded, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import look_ahead, serial_algebra
+from recon.look.rig import RigFigures
 from recon.map.drive.drive import Workspace
 from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.protocol import OdometryFrame
-from recon.sources.source import StereoSource, check_source
+from recon.sources.source import SourceFigures, StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor
 
 START_WITHIN_M: Final = 10.0  # how far from the start that is given the first fix may be
@@ -85,6 +87,30 @@ class LocalizedFrame:
         return f"{found.state.value}, {by}"
 
 
+@dataclass(frozen=True)
+class FrameSeconds(Figures):
+    """Times that frames took, in seconds."""
+
+    median: float
+    p95: float
+    max: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizedFigures(Figures):
+    """In how many frames the drive was found in the map, and how precisely."""
+
+    frames: int
+    frames_searching: int
+    frames_tracking: int
+    frames_coasting: int
+    frames_lost: int
+    first_fix_frame: int | None  # the first frame with a pose; None = there is none
+    median_sigma_m: float | None  # standard deviation of a position
+    fps: float | None
+    seconds_per_frame: FrameSeconds
+
+
 @dataclass(frozen=True, eq=False)
 class LocalizedDrive:
     """A drive in a map: all its frames in order, and the seconds from the first to the last.
@@ -113,22 +139,25 @@ class LocalizedDrive:
         times_s = np.array([frame.time_s for frame in self.placed])
         return Trajectory(poses.reshape(-1, 4, 4), times_s)
 
-    def figures(self) -> dict[str, Any]:
+    def figures(self) -> LocalizedFigures:
         states = [frame.located.state for frame in self.frames]
         seconds = np.array([frame.seconds for frame in self.frames])
         sigmas_m = [frame.located.sigma_m for frame in self.tracked]
-        return {
-            "frames": len(states),
-            **{f"frames_{state.value}": states.count(state) for state in State},
-            "first_fix_frame": self.tracked[0].index if self.tracked else None,
-            "median_sigma_m": float(np.median(sigmas_m)) if sigmas_m else None,
-            "fps": len(states) / self.seconds if self.seconds > 0 else None,
-            "seconds_per_frame": {
-                "median": float(np.median(seconds)),
-                "p95": float(np.percentile(seconds, 95)),
-                "max": float(seconds.max()),
-            },
-        }
+        return LocalizedFigures(
+            frames=len(states),
+            frames_searching=states.count(State.SEARCHING),
+            frames_tracking=states.count(State.TRACKING),
+            frames_coasting=states.count(State.COASTING),
+            frames_lost=states.count(State.LOST),
+            first_fix_frame=self.tracked[0].index if self.tracked else None,
+            median_sigma_m=float(np.median(sigmas_m)) if sigmas_m else None,
+            fps=len(states) / self.seconds if self.seconds > 0 else None,
+            seconds_per_frame=FrameSeconds(
+                median=float(np.median(seconds)),
+                p95=float(np.percentile(seconds, 95)),
+                max=float(seconds.max()),
+            ),
+        )
 
     def warnings(self) -> list[str]:
         states = [frame.located.state for frame in self.frames]
@@ -212,6 +241,35 @@ def localize_sequence(
     return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
 
 
+@dataclass(frozen=True, kw_only=True)
+class LocalizeSummary(RunSummary):
+    """What `recon localize` found."""
+
+    source: str
+    map_run: str  # folder of the map, or its file
+    T_map_world: Float64  # (4, 4)
+    drive: LocalizedFigures = inline()
+    rig: RigFigures
+    read: SourceFigures = inline()
+
+    def rows(self) -> Rows:
+        found = self.drive
+        tracked = f"{found.frames_tracking} of {counted(found.frames, 'frame')}"
+        left = f"{found.frames_coasting} by odometry alone, {found.frames_searching} not yet found"
+        first, sigma_m = found.first_fix_frame, found.median_sigma_m
+        where = "no frame has a pose" if first is None else f"from frame {first} on"
+        sure = "" if sigma_m is None else f", positions ± {metres(sigma_m)}"
+        ms = 1e3 * found.seconds_per_frame.p95
+        return [
+            (f"{tracked} of {self.source} found in {self.map_run}",),
+            *self.folder_row(),
+            ("poses", "trajectory_tum.txt", where + sure),
+            ("others", f"{left}; lost {counted(found.frames_lost, 'time')}"),
+            *self.cost_row(f"95 % of frames in {ms:.0f} ms"),
+            ("next", f"recon view {shown_path(self.out or '')}"),
+        ]
+
+
 @dataclass(frozen=True, eq=False)
 class LocalizeResult:
     """Results of a run; the grid is None where that of the map has none."""
@@ -220,4 +278,4 @@ class LocalizeResult:
     map_name: str
     drive: LocalizedDrive
     grid: OccupancyGrid | None
-    summary: dict[str, Any] = field(default_factory=dict)
+    summary: LocalizeSummary

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -88,8 +88,9 @@ def join_parts(
         part, begin = part_map.session(), len(session) - lead
         if not len(session):
             session.set_axes(part.T_map_world, part.camera)
-        how: Any = {"search": settings.loops.enabled, "scale": settings.scale}
-        detector = detector or LoopDetector(session.keyframes, part.camera, **how)
+        detector = detector or LoopDetector(
+            session.keyframes, part.camera, search=settings.loops.enabled, scale=settings.scale
+        )
         T_world_part = _append_frames(session, part, lead)
         rays = (key[1] for key in part_map.store.keys(RAYS) if isinstance(key, tuple))
         own: dict[Key, Key] = {

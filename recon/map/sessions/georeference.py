@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from recon.core.geometry.alignment import fit_points
 from recon.core.geometry.se3 import apply
+from recon.core.summary import Figures, optional
 from recon.core.text import metres
 from recon.core.values.arrays import Float64
 from recon.io.models.las import check_inside
@@ -19,6 +20,36 @@ from recon.map.sessions.measured import LARGEST_MISFIT, Survey, measure_along, s
 
 _LARGEST_YAW_RAD: Final = 0.1  # sigma that is said: places are off by a tenth of their distance
 _LARGEST_STRETCH: Final = 0.05  # by how much the path may be too long or short before it is said
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlFigures(Figures):
+    """How far the map is off a control point, map minus survey, and what was expected."""
+
+    east_m: float
+    north_m: float
+    up_m: float
+    sigma_m: float  # standard deviation that was expected
+    used: bool  # whether it places the map
+    check: bool  # whether it only compares
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurveyFigures(Figures):
+    """How a map lies in the coordinates of a survey."""
+
+    positions: int
+    positions_left_out: int
+    misfit_rms_m: float
+    misfit_max_m: float
+    span_m: float  # diagonal of the box around the positions
+    scale: float  # distances between positions, divided by those in the map
+    tilt_deg: float
+    yaw_sigma_deg: float
+    rotation_sigma_deg: float  # about the axis that is known worst
+    edge_sigma_m: float  # of that frame of the map which the rotation moves most
+    T_survey_map: Float64  # (4, 4), rigid
+    control: Mapping[str, ControlFigures] | None = optional()  # by name of the control point
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +65,7 @@ class Georeference:
     lines: tuple[str, ...]  # warnings that name them
     turn: Float64  # (3, 3), rad², of `fixed_turn`
     edge_m: float  # by which it moves the frame of the map that it moves most, sigma
-    points: Mapping[str, Any] = field(default_factory=dict)  # figures of each control point
+    points: Mapping[str, ControlFigures] = field(default_factory=dict)
 
     @property
     def rms_m(self) -> float:
@@ -45,21 +76,21 @@ class Georeference:
         """Angle between the map's up and that of the survey."""
         return float(np.degrees(np.arccos(min(1.0, self.T_survey_map[2, 2]))))
 
-    def figures(self) -> dict[str, Any]:
-        return {
-            "positions": len(self.misfit_m),
-            "positions_left_out": self.left_out,
-            "misfit_rms_m": self.rms_m,
-            "misfit_max_m": float(self.misfit_m.max()),
-            "span_m": self.span_m,
-            "scale": self.scale,
-            "tilt_deg": self.tilt_deg,
-            "yaw_sigma_deg": math.degrees(math.sqrt(self.turn[2, 2])),
-            "rotation_sigma_deg": math.degrees(math.sqrt(np.linalg.eigvalsh(self.turn)[-1])),
-            "edge_sigma_m": self.edge_m,
-            "T_survey_map": self.T_survey_map.tolist(),
-            **({"control": dict(self.points)} if self.points else {}),
-        }
+    def figures(self) -> SurveyFigures:
+        return SurveyFigures(
+            positions=len(self.misfit_m),
+            positions_left_out=self.left_out,
+            misfit_rms_m=self.rms_m,
+            misfit_max_m=float(self.misfit_m.max()),
+            span_m=self.span_m,
+            scale=self.scale,
+            tilt_deg=self.tilt_deg,
+            yaw_sigma_deg=math.degrees(math.sqrt(self.turn[2, 2])),
+            rotation_sigma_deg=math.degrees(math.sqrt(np.linalg.eigvalsh(self.turn)[-1])),
+            edge_sigma_m=self.edge_m,
+            T_survey_map=self.T_survey_map,
+            control=self.points or None,
+        )
 
     def warnings(self) -> list[str]:
         """Return lines of what is left out, and of map and positions that differ."""

@@ -4,5 +4,6 @@
   one image, and whether it has the stated size;
 - `stereo.py`: first guesses, both cameras without the views that do not fit, and how sure the fit
   is; `bundle.py`: the solver;
-- `verdict.py`: its figures and files, and what it is good for.
+- `figures.py`: how well it describes the views; `verdict.py`: all of it, its files, and what it is
+  good for.
 """

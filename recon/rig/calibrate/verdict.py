@@ -9,12 +9,14 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from recon.core.text import counted, to_json
+from recon.core.summary import Rows, RunSummary, inline, optional, shown_path
+from recon.core.text import counted, metres
 from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bundle import View
+from recon.rig.calibrate.figures import CalibrationFigures, DepthErrorCm, WorkingError
 from recon.rig.calibrate.stereo import Spread, StereoFit
 from recon.rig.settings import CalibratedSettings
 from recon.rig.written import CalibrationForm, write_rig
@@ -93,31 +95,32 @@ def verdict_of_calibration(findings: Sequence[CalibrationFinding]) -> Verdict:
 
 
 def judge_calibration(
-    board: CalibrationBoard, images: ImagePairs, summary: dict[str, Any]
+    board: CalibrationBoard, images: ImagePairs, figures: CalibrationFigures
 ) -> list[CalibrationFinding]:
     """Return all findings of a calibration, the gravest first."""
+    known = figures.to_json()
 
     def described(severity: Severity, found: Found) -> list[CalibrationFinding]:
         return [
-            CalibrationFinding(code, severity, _TEXTS[code].format_map(summary | own))
+            CalibrationFinding(code, severity, _TEXTS[code].format_map(known | own))
             for code, own in found
         ]
 
-    ratio = summary["working_error"]["calibration_ratio"]
+    ratio = figures.working_error.calibration_ratio
     found = described(
-        "fatal" if ratio is None or ratio > _USABLE else "warning", _depth_faults(board, summary)
+        "fatal" if ratio is None or ratio > _USABLE else "warning", _depth_faults(board, figures)
     )
-    found += described("warning", _doubts(board, summary))
+    found += described("warning", _doubts(board, figures))
     lacking: list[CalibrationFinding] = []
     if verdict_of_calibration(found) != "good":
         nothing = CalibrationFinding("more", "note", _NOTHING_LACKS)
-        lacking = described("note", _lacks(summary)) or [nothing]
-    return [*found, *described("note", _left_out(board, images, summary)), *lacking]
+        lacking = described("note", _lacks(figures)) or [nothing]
+    return [*found, *described("note", _left_out(board, images, figures)), *lacking]
 
 
-def _depth_faults(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
-    expected = summary["working_error"]
-    distance_m, ratio = expected["distance_m"], expected["calibration_ratio"]
+def _depth_faults(board: CalibrationBoard, found: CalibrationFigures) -> Found:
+    expected = found.working_error
+    distance_m, ratio = expected.distance_m, expected.calibration_ratio
     at = _length(distance_m, board)
     if ratio is None:
         yield "overlap", {"at": at}
@@ -126,23 +129,22 @@ def _depth_faults(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
         yield "depth", {"at": at, "wrong": wrong, "percent": 100 * ratio}
 
 
-def _doubts(board: CalibrationBoard, summary: dict[str, Any]) -> Found:
-    if summary["views_used"] < _FEW_VIEWS:
-        yield "views", {"views": counted(summary["views_used"], "different view")}
-    for side in ("left", "right"):
-        ratio = summary[f"coverage_{side}"]
+def _doubts(board: CalibrationBoard, found: CalibrationFigures) -> Found:
+    if found.views_used < _FEW_VIEWS:
+        yield "views", {"views": counted(found.views_used, "different view")}
+    for side, ratio in (("left", found.coverage_left), ("right", found.coverage_right)):
         if ratio < _SMALL_COVERAGE:
             yield "coverage", {"percent": 100 * ratio, "side": side}
-    if summary["stereo_rms_px"] > _APART * max(summary["left_rms_px"], summary["right_rms_px"]):
+    if found.stereo_rms_px > _APART * max(found.left_rms_px, found.right_rms_px):
         yield "together", {}
-    if summary["epipolar_95_px"] > _ROWS_PX:
+    if found.epipolar_95_px > _ROWS_PX:
         yield "rows", {}
     shortest, longest = _USUAL_BASELINE_M
-    if board.metric and not shortest <= summary["baseline_m"] <= longest:
+    if board.metric and not shortest <= found.baseline_m <= longest:
         yield "baseline", {"square_mm": 1e3 * board.square_m}
 
 
-def _left_out(board: CalibrationBoard, images: ImagePairs, summary: dict[str, Any]) -> Found:
+def _left_out(board: CalibrationBoard, images: ImagePairs, found: CalibrationFigures) -> Found:
     """Yield what was left out or is not known; none of it makes the depth of this rig worse."""
     if not board.metric:
         yield "square", {}
@@ -151,28 +153,28 @@ def _left_out(board: CalibrationBoard, images: ImagePairs, summary: dict[str, An
     if images.lonely:
         names = _listed([path.name for path in images.lonely])
         yield "unpaired", {"count": len(images.lonely), "names": names}
-    if summary["pictures_without_board"]:
-        yield "board", {"names": _listed(summary["pictures_without_board"])}
-    if summary["views_dropped"]:
-        yield "dropped", {"names": _listed(summary["views_dropped"])}
-    if summary["views_repeated"]:
-        yield "repeats", {"views": counted(len(summary["views_repeated"]), "view")}
+    if found.pictures_without_board:
+        yield "board", {"names": _listed(found.pictures_without_board)}
+    if found.views_dropped:
+        yield "dropped", {"names": _listed(found.views_dropped)}
+    if found.views_repeated:
+        yield "repeats", {"views": counted(len(found.views_repeated), "view")}
 
 
-def _lacks(summary: dict[str, Any]) -> Found:
-    side, ratio = min((summary[f"coverage_{side}"], side) for side in ("left", "right"))[::-1]
+def _lacks(found: CalibrationFigures) -> Found:
+    ratio, side = min((found.coverage_left, "left"), (found.coverage_right, "right"))
     if _SMALL_COVERAGE <= ratio < _COVERED:
         yield "corners", {"percent": 100 * ratio, "side": side}
-    if summary["tilted_ratio"] < _TILTED:
-        yield "tilt", {"percent": 100 * summary["tilted_ratio"]}
-    low, high = summary["focal_interval_px"]
-    if high - low > 2 * _UNSURE_FOCAL * summary["focal_px"]:
+    if found.tilted_ratio < _TILTED:
+        yield "tilt", {"percent": 100 * found.tilted_ratio}
+    low, high = found.focal_interval_px
+    if high - low > 2 * _UNSURE_FOCAL * found.focal_px:
         yield "focal", {"low": low, "high": high}
-    if summary["far_to_near"] < _FAR_TO_NEAR:
+    if found.far_to_near < _FAR_TO_NEAR:
         yield "distances", {}
-    if summary["stereo_rms_px"] > _SHARP_PX:
+    if found.stereo_rms_px > _SHARP_PX:
         yield "sharpness", {}
-    if _FEW_VIEWS <= summary["views_used"] < _ENOUGH_VIEWS:
+    if _FEW_VIEWS <= found.views_used < _ENOUGH_VIEWS:
         yield "more", {}
 
 
@@ -182,7 +184,7 @@ def _length(metres: float, board: CalibrationBoard) -> str:
     return f"{100 * metres:.2g} cm" if metres < 0.995 else f"{metres:.3g} m"
 
 
-def _listed(names: list[str]) -> str:
+def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
@@ -195,6 +197,45 @@ _KEPT: Final = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True, kw_only=True)
+class CalibrationSummary(RunSummary):
+    """What `recon calibrate` found; its warnings are the texts of its findings."""
+
+    figures: CalibrationFigures = inline()
+    model: str  # of the lenses
+    verdict: Verdict
+    findings: Sequence[CalibrationFinding]
+    frames_left_out: int  # images without a partner
+    files: Sequence[str] | None = optional()  # where else the calibration was written
+
+    def remarks(self) -> list[tuple[str, str]]:
+        return [(finding.severity, finding.text) for finding in self.findings]
+
+    def rows(self) -> Rows:
+        found, out = self.figures, self.out or ""
+        low_m, high_m = found.baseline_interval_m
+        low_px, high_px = found.focal_interval_px
+        baseline = f"{found.baseline_m:.4g} m ({low_m:.4g} to {high_m:.4g})"
+        focal = f"{found.focal_px:.1f} px ({low_px:.1f} to {high_px:.1f})"
+        views = f"{found.views_used} of {counted(found.views, 'view')}"
+        working = found.working_error
+        ratio, at = working.calibration_ratio, metres(working.distance_m)
+        off = "no common view" if ratio is None else f"error of {100 * ratio:.1f} %"
+        file = (self.files or [str(Path(out, "calibration.yaml"))])[0]
+        again = "take other views as said above, and calibrate again"
+        use = f"recon audit DRIVE --calib {shown_path(file)}"
+        return [
+            (f"calibration of {views}, lens {self.model}: {self.verdict}",),
+            ("file", ", ".join(self.files or [file])),
+            ("report", str(Path(out, "report.html"))),
+            ("fit", f"{found.stereo_rms_px:.2f} px, epipolar error {found.epipolar_px:.2f} px"),
+            ("rig", f"baseline {baseline}, focal {focal}"),
+            ("depth", f"{off} at {at} expected of the calibration"),
+            *self.cost_row(),
+            ("next", again if self.verdict == "repeat" else use),
+        ]
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
     """The results of a run."""
@@ -205,21 +246,33 @@ class CalibrationResult:
     spread: Spread
     turns: RectifyingTurns
     epipolar_error_px: Float64  # (N,), epipolar errors of all corners after rectification
-    summary: dict[str, Any]  # the figures of ``summary.json``
+    summary: CalibrationSummary
 
 
 def describe_calibration(
-    seen: BoardViews, fit: StereoFit, spread: Spread, config: CalibratedSettings
+    seen: BoardViews,
+    fit: StereoFit,
+    spread: Spread,
+    config: CalibratedSettings,
+    images: ImagePairs,
 ) -> CalibrationResult:
-    """Rectify the views with the calibrated rig, and measure how well it describes them."""
+    """Rectify the views with the calibrated rig, measure how well it describes them, and judge."""
     turns = plan_turns(fit.calibration, config.rectification)
     rows = []
     for left_px, right_px in map(shared_pixels, fit.views):
         left = turns.place(fit.calibration, left_px)
         rows.append(left[:, 1] - turns.place(fit.calibration, right_px, right=True)[:, 1])
     epipolar_error_px = np.concatenate(rows)
-    summary = _summarise(seen, fit, spread, epipolar_error_px)
-    summary["rectified_focal_px"] = turns.camera.focal_px
+    figures = _figures(seen, fit, spread, epipolar_error_px, turns.camera.focal_px)
+    findings = judge_calibration(seen.board, images, figures)
+    summary = CalibrationSummary(
+        figures=figures,
+        model=config.calibration.model,
+        verdict=verdict_of_calibration(findings),
+        findings=findings,
+        frames_left_out=len(images.lonely),
+        warnings=[finding.text for finding in findings],
+    )
     return CalibrationResult(config, seen, fit, spread, turns, epipolar_error_px, summary)
 
 
@@ -227,58 +280,72 @@ def write_calibration(
     path: Path, run: CalibrationResult, form: CalibrationForm | None = None
 ) -> tuple[Path, ...]:
     """Write the calibrated rig; see `write_rig`."""
-    quality = {key: run.summary[key] for key in _KEPT}
+    found = run.summary.to_json()
+    quality = {key: found[key] for key in _KEPT}
     return write_rig(path, run.fit.calibration, run.config.rectification, form, quality)
 
 
-def _summarise(
-    seen: BoardViews, fit: StereoFit, spread: Spread, epipolar_error_px: Float64
-) -> dict[str, Any]:
-    rig, away_m = fit.calibration, _distances_m(fit)
+def _figures(
+    seen: BoardViews,
+    fit: StereoFit,
+    spread: Spread,
+    epipolar_error_px: Float64,
+    rectified_focal_px: float,
+) -> CalibrationFigures:
+    rig, away_m, away = fit.calibration, _distances_m(fit), spread.working
     # Angles between the board's normal and the optical axis of the left camera.
     tilts_deg = np.degrees(np.arccos(np.clip(np.abs(fit.state.T_rig_board[:, 2, 2]), 0.0, 1.0)))
-    return {
-        "board": str(seen.board),
-        "model": rig.left.model,
-        "width_px": seen.size_px[0],
-        "height_px": seen.size_px[1],
-        "stereo_rms_px": fit.rms_px,
-        "left_rms_px": fit.alone_px[0],
-        "right_rms_px": fit.alone_px[1],
-        "epipolar_px": float(np.abs(epipolar_error_px).mean()),
-        "epipolar_95_px": float(np.quantile(np.abs(epipolar_error_px), 0.95)),
-        "baseline_m": rig.baseline_m,
-        "baseline_interval_m": list(spread.baseline_m),
-        "baseline_squares": rig.baseline_m / seen.board.square_m,
-        "focal_px": float(rig.left.matrix[0, 0]),
-        "focal_interval_px": list(spread.focal_px),
-        "focal_right_px": float(rig.right.matrix[0, 0]),
-        "rotation_spread_deg": spread.rotation_deg,
-        "views": seen.count,
-        "views_used": len(fit.views),
-        "views_repeated": list(fit.repeated),
-        "views_dropped": list(fit.dropped),
-        "dropped_error_px": fit.dropped,
-        "pictures_without_board": [path.name for path in seen.empty],
-        "view_errors_px": {
+    return CalibrationFigures(
+        board=str(seen.board),
+        width_px=seen.size_px[0],
+        height_px=seen.size_px[1],
+        stereo_rms_px=fit.rms_px,
+        left_rms_px=fit.alone_px[0],
+        right_rms_px=fit.alone_px[1],
+        epipolar_px=float(np.abs(epipolar_error_px).mean()),
+        epipolar_95_px=float(np.quantile(np.abs(epipolar_error_px), 0.95)),
+        baseline_m=rig.baseline_m,
+        baseline_interval_m=list(spread.baseline_m),
+        baseline_squares=rig.baseline_m / seen.board.square_m,
+        focal_px=float(rig.left.matrix[0, 0]),
+        focal_interval_px=list(spread.focal_px),
+        focal_right_px=float(rig.right.matrix[0, 0]),
+        rotation_spread_deg=spread.rotation_deg,
+        views=seen.count,
+        views_used=len(fit.views),
+        views_repeated=list(fit.repeated),
+        views_dropped=list(fit.dropped),
+        dropped_error_px=fit.dropped,
+        pictures_without_board=[path.name for path in seen.empty],
+        view_errors_px={
             view.name: [float(value) for value in errors]
             for view, errors in zip(fit.views, fit.errors_px, strict=True)
         },
-        "coverage_left": _coverage([view.seen[0].pixels for view in fit.views], rig.left),
-        "coverage_right": _coverage([view.seen[1].pixels for view in fit.views], rig.right),
-        "tilt_max_deg": float(tilts_deg.max()),
-        "tilted_ratio": float((tilts_deg >= TILT_DEG).mean()),
-        "far_to_near": float(away_m.max() / away_m.min()),
-        "depth_error_cm": {
-            f"{each.depth_m:g}": {k: to_json(100.0 * getattr(each, f"{k}_m")) for k in _DEPTH_CM}
+        coverage_left=_coverage([view.seen[0].pixels for view in fit.views], rig.left),
+        coverage_right=_coverage([view.seen[1].pixels for view in fit.views], rig.right),
+        tilt_max_deg=float(tilts_deg.max()),
+        tilted_ratio=float((tilts_deg >= TILT_DEG).mean()),
+        far_to_near=float(away_m.max() / away_m.min()),
+        depth_error_cm={
+            f"{each.depth_m:g}": DepthErrorCm(
+                _known(100.0 * each.calibration_m),
+                _known(100.0 * each.low_m),
+                _known(100.0 * each.high_m),
+                100.0 * each.matching_m,
+            )
             for each in spread.depths
         },
-        "working_error": {
-            "distance_m": spread.working.depth_m,
-            "calibration_ratio": to_json(spread.working.calibration_m / spread.working.depth_m),
-            "matching_ratio": spread.working.matching_m / spread.working.depth_m,
-        },
-    }
+        working_error=WorkingError(
+            away.depth_m,
+            _known(away.calibration_m / away.depth_m),
+            away.matching_m / away.depth_m,
+        ),
+        rectified_focal_px=rectified_focal_px,
+    )
+
+
+def _known(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 def shared_pixels(view: View) -> tuple[Float64, Float64]:
@@ -303,23 +370,3 @@ def _distances_m(fit: StereoFit) -> Float64:
         for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
     ]
     return np.asarray(np.linalg.norm(middles, axis=1))
-
-
-def describe_depths(summary: dict[str, Any]) -> dict[str, str]:
-    """Return the depth errors of a summary as text, one line per distance."""
-    working = summary["working_error"]
-    ratio = working["calibration_ratio"]
-    text = "unknown" if ratio is None else f"{100 * ratio:.1f} %"
-    lines = {f"depth error at the working distance of {working['distance_m']:.3g} m": text}
-    for depth, cm in summary["depth_error_cm"].items():
-        known = "no common view"
-        if cm["calibration"] is not None:
-            known = f"{_short(cm['calibration'])} cm"
-            known += f", in the middle {_short(cm['low'])} to {_short(cm['high'])}"
-        lines[f"depth error at {depth} m"] = f"{known}; of matching {_short(cm['matching'])} cm"
-    return lines
-
-
-def _short(value: float) -> str:
-    """Return two significant digits, without an exponent."""
-    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"

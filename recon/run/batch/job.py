@@ -16,14 +16,16 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import IO, Any, Final, Literal
 
 from pydantic import ConfigDict
 from pydantic.dataclasses import dataclass as checked
+from typing_extensions import Self
 
 from recon.core.errors import OutputError
+from recon.core.summary import RunSummary, inline
 from recon.io.atomic import is_locked
 from recon.io.files import reading, refuse_links
 from recon.run.directory import RECORD, STARTED, lock_file, state_folder
@@ -161,6 +163,20 @@ def run_job(
     return ended
 
 
+@dataclass(frozen=True, kw_only=True)
+class PrintedSummary(RunSummary):
+    """What a command printed that has no result folder."""
+
+    printed: Mapping[str, Any] = inline()
+
+    @classmethod
+    def of(cls, printed: Mapping[str, Any]) -> Self:
+        """Return what was printed; the cost is that of the job."""
+        own = {one.name for one in fields(RunSummary)}
+        rest = {key: value for key, value in printed.items() if key not in own}
+        return cls(printed=rest, warnings=printed.get("warnings", ()))
+
+
 def _run(
     job: Job, line: list[str], out: Path, log: IO[bytes], stopped: Callable[[], bool]
 ) -> tuple[int, str]:
@@ -190,7 +206,9 @@ def _run(
             if process.returncode == 0 and not job.writes:
                 printed.seek(0)
                 with Run(job.command, out) as run:
-                    run.finish(json.loads(printed.read()), source=job.source, inputs=())
+                    run.finish(
+                        PrintedSummary.of(json.loads(printed.read())), source=job.source, inputs=()
+                    )
     except (OSError, OutputError, ValueError) as failure:
         return -1, str(failure)
     code, error = process.returncode, said[0].removeprefix("error: ")[:_LONGEST]

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from recon.core.errors import FormatError
 from recon.core.progress import series, stage
+from recon.core.summary import Figures, inline, optional
 from recon.io.atomic import is_locked
 from recon.io.files import read_text, reading
 from recon.run.batch.cluster import BatchOptions, Cluster
@@ -44,6 +45,32 @@ _SIGMAS: Final = 1.4826
 _LEAST_RATIO: Final = 0.1
 _UNUSUAL: Final = 3.5
 """Standard deviations from which a figure is unusual: 0.05 % of normal ones are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobFacts(Figures):
+    """How a job ended."""
+
+    name: str
+    command: str
+    source: str
+    state: str
+    tries: int
+    seconds: float  # of its last try
+    worker: str
+    bytes: int  # of all files in its folder
+    error: str | None = optional()  # why it failed
+    swept: Mapping[str, Any] | None = optional()  # its settings of a sweep
+    remark: str | None = optional()  # what is unusual about it
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobSummary(Figures):
+    """How a job ended, the numbers of its summary by dotted name, and its warnings."""
+
+    facts: JobFacts = inline()
+    figures: Mapping[str, float]
+    warnings: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -79,25 +106,30 @@ class JobResult:
 
     @property
     def event(self) -> dict[str, Any]:
-        return {"event": "job", **self.facts}
+        return {"event": "job", **self.facts.to_json()}
 
     @property
-    def facts(self) -> dict[str, Any]:
-        """How it ended, as the summary has it, without figures and warnings."""
+    def facts(self) -> JobFacts:
+        """How it ended."""
         job, last = self.job, self.last
-        return {
-            "name": job.name,
-            "command": job.command,
-            "source": job.source,
-            "state": "failed" if self.failed else last.state,
-            "tries": last.tries,
-            "seconds": last.seconds,
-            "worker": last.worker,
-            "bytes": self.bytes,
-            **({"error": last.error} if self.failed else {}),
-            **({"swept": dict(job.swept)} if job.swept else {}),
-            **({"remark": self.remark} if self.remark else {}),
-        }
+        return JobFacts(
+            name=job.name,
+            command=job.command,
+            source=job.source,
+            state="failed" if self.failed else last.state,
+            tries=last.tries,
+            seconds=last.seconds,
+            worker=last.worker,
+            bytes=self.bytes,
+            error=last.error if self.failed else None,
+            swept=dict(job.swept) or None,
+            remark=self.remark or None,
+        )
+
+    @property
+    def summary(self) -> JobSummary:
+        """How it ended, with figures and warnings."""
+        return JobSummary(facts=self.facts, figures=self.figures, warnings=self.warnings)
 
 
 def work_off(
@@ -151,11 +183,11 @@ def wrong_first(results: Iterable[JobResult]) -> list[JobResult]:
     return sorted(results, key=lambda one: urgency(one.facts, one.figures))
 
 
-def urgency(facts: Mapping[str, Any], figures: Mapping[str, float]) -> tuple[Any, ...]:
+def urgency(facts: JobFacts, figures: Mapping[str, float]) -> tuple[bool, float, float, bool]:
     """Return what `wrong_first` sorts by; jobs that are alike in it keep their order."""
     untrusted = figures.get("frames_not_trusted", 0.0) / max(1.0, figures.get("frames", 1.0))
     drift = next((figures[name] for name in _DRIFT if name in figures), 0.0)
-    return facts["state"] != "failed", -untrusted, -drift, "remark" not in facts
+    return facts.state != "failed", -untrusted, -drift, facts.remark is None
 
 
 def accuracies(figures: Iterable[Mapping[str, float]]) -> list[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from typing_extensions import Self
 
 from recon.core.errors import MatchingError, SettingsError
 from recon.core.settings import Settings
+from recon.core.summary import Figures
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.core.values.arrays import Bool, Float32, UInt8
 from recon.core.values.image import ASSUMED_SIGMA_PX
@@ -92,18 +93,24 @@ class OnnxSettings(Settings):
         return self.width_px, self.height_px
 
 
-def describe_network(settings: OnnxSettings) -> dict[str, Any]:
-    """Return what a result says of its network, ready for JSON: file, checksum, licence, sets."""
+@dataclass(frozen=True)
+class NetworkFigures(Figures):
+    """What a result says of its network."""
+
+    file: str
+    sha256: str
+    preset: str | None
+    licence: str
+    trained_on: str
+
+
+def describe_network(settings: OnnxSettings) -> NetworkFigures | None:
+    """Return what a result says of its network; None = there is no such file."""
     if settings.model is None or not settings.model.is_file():
-        return {}
-    use = settings.read()
-    return {
-        "file": settings.model.name,
-        "sha256": hashlib.sha256(settings.model.read_bytes()).hexdigest(),
-        "preset": settings.preset,
-        "licence": use.licence,
-        "trained_on": use.trained_on,
-    }
+        return None
+    use, name = settings.read(), settings.model.name
+    digest = hashlib.sha256(settings.model.read_bytes()).hexdigest()
+    return NetworkFigures(name, digest, settings.preset, use.licence, use.trained_on)
 
 
 class OnnxMatcher:

@@ -75,7 +75,7 @@ def test_frames_between_those_of_the_map_are_found_to_centimetres(odd, truth):
     assert np.median(error_m) < 0.05
     assert error_m.max() < 0.2
     assert np.median(error_deg) < 0.15
-    assert odd.figures()["first_fix_frame"] <= 1
+    assert odd.figures().to_json()["first_fix_frame"] <= 1
     for frame in odd.tracked:
         off = se3.as_step(se3.invert(truth[2 * frame.index + 1]) @ frame.located.T_world_camera)
         assert off @ np.linalg.solve(frame.located.covariance, off) < 22.5  # 0.1 %, six freedoms
@@ -154,7 +154,11 @@ def test_after_a_jump_to_a_place_that_is_not_in_the_map_the_drive_coasts_and_is_
     sigmas_m = [one.sigma_m for one in (before.located, *found[:lost])]
     assert (np.diff(sigmas_m) > 0).all()
     assert all("coasting" in frame.state for frame in after[:lost])
-    assert drive.figures()["frames_coasting"] == lost == len(drive.placed) - len(drive.tracked)
+    assert (
+        drive.figures().to_json()["frames_coasting"]
+        == lost
+        == len(drive.placed) - len(drive.tracked)
+    )
     coasting, lost_once = drive.warnings()
     assert "by odometry alone" in coasting
     assert "lost once" in lost_once

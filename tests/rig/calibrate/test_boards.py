@@ -168,7 +168,7 @@ PT_PER_MM = 72 / 25.4
 @pytest.mark.parametrize(("text", "square_mm"), [(CHESS, 25.0), (CHARUCO, 30.0)])
 def test_a_png_has_its_corners_where_they_are_on_paper(tmp_path, text, square_mm):
     board = parse_board(text)
-    figures = write_board(tmp_path / "b.png", board, dpi=150)
+    figures = write_board(tmp_path / "b.png", board, dpi=150).to_json()
     with Image.open(tmp_path / "b.png") as image:
         dpi = image.info["dpi"]
         size_mm = np.array(image.size) * 25.4 / dpi

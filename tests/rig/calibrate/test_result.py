@@ -1,5 +1,6 @@
 """Figures, text and files of a calibration, and the verdict on it."""
 
+from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
 from recon.rig.calibrate.board_views import BoardViews
+from recon.rig.calibrate.figures import WorkingError
 from recon.rig.calibrate.stereo import calibrate_stereo, measure_spread
 from recon.rig.calibrate.verdict import (
     describe_calibration,
@@ -18,6 +20,7 @@ from recon.rig.calibrate.verdict import (
 from recon.rig.settings import CalibratedSettings, CalibrationSettings
 from recon.rig.written import CalibrationForm
 from recon.sources.images import ImagePairs
+from tests.scenery.calibrated import GOOD
 
 SIZE = (640, 480)
 
@@ -29,8 +32,8 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     seen = BoardViews(tuple(views), {}, (), SIZE, 14, parse_board(CHESS))
     spread = measure_spread(fit, settings)
     config = CalibratedSettings(calibration=settings)
-    run = describe_calibration(seen, fit, spread, config)
-    found = run.summary
+    run = describe_calibration(seen, fit, spread, config, PAIRS)
+    found = run.summary.to_json()
     assert found["baseline_squares"] == pytest.approx(rig.baseline_m / 0.025, rel=0.01)
     assert 0.05 < found["epipolar_px"] < found["epipolar_95_px"] < 0.5
     normals = np.array([abs(T[2, 2]) for T in fit.state.T_rig_board])
@@ -42,7 +45,6 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     cells = {(int((u + 0.5) // 80), int((v + 0.5) // 80)) for u, v in pixels}
     assert found["coverage_left"] == len(cells) / 48
     assert found["depth_error_cm"]["2"]["high"] == pytest.approx(100 * spread.depths[0].high_m)
-    found["verdict"] = "good"
     for form in get_args(CalibrationForm):
         files = write_calibration(tmp_path / form / "rig.yaml", run, form)
         read = read_calibration(files[0], *SIZE)
@@ -53,21 +55,12 @@ CHESS = "chess:9x6:25mm"
 PAIRS = ImagePairs((), by_order=False)
 
 
-GOOD: dict[str, Any] = {
-    "working_error": {"distance_m": 4.0, "calibration_ratio": 0.01, "matching_ratio": 0.02},
-    "views_used": 25, "views_dropped": [], "views_repeated": [], "pictures_without_board": [],
-    "coverage_left": 0.9, "coverage_right": 0.9, "tilted_ratio": 0.7, "far_to_near": 3.0,
-    "stereo_rms_px": 0.2, "left_rms_px": 0.2, "right_rms_px": 0.2, "epipolar_95_px": 0.3,
-    "baseline_m": 0.12, "focal_px": 500.0, "focal_interval_px": [499.0, 501.0],
-}  # fmt: skip
-
-
 def error(ratio: float | None) -> dict[str, Any]:
-    return {"working_error": {"distance_m": 4.0, "calibration_ratio": ratio}}
+    return {"working_error": WorkingError(4.0, ratio, 0.02)}
 
 
 def judge(board: str = CHESS, **other: Any) -> tuple[str, dict[str, str]]:
-    found = judge_calibration(parse_board(board), PAIRS, GOOD | other)
+    found = judge_calibration(parse_board(board), PAIRS, replace(GOOD, **other))
     return verdict_of_calibration(found), {finding.code: finding.text for finding in found}
 
 

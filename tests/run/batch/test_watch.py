@@ -46,7 +46,7 @@ def say(folder, name, *outcomes, **summary):
 
 
 def states(results):
-    return {one.job.name: one.facts["state"] for one in results}
+    return {one.job.name: one.facts.state for one in results}
 
 
 def test_a_job_is_seen_to_run_and_to_end_with_its_figures_and_size(folder, lock):

@@ -208,7 +208,7 @@ def test_half_size_scenes_are_better_than_those_of_sgm(recon_data, tmp_path):
         matchers=["sgm", "fine"],
         truth=scenes / "trainingQ",
         out=tmp_path,
-    )
+    ).to_json()
     for limit, ratio in (("1", 0.9), ("2", 0.85)):
         each = [
             figures["matchers"][n]["weighted"]["nonocc"]["dense"]["bad"][limit]

@@ -215,7 +215,7 @@ def test_a_network_laid_out_like_that_of_a_preset_is_fed_as_it_is_meant(tmp_path
     pair, truth = plane_pair()
     found = run(path, pair, preset=preset)
     assert np.nanmedian(np.abs(found.values - truth)) < 0.5
-    about = describe_network(OnnxSettings(model=path, preset=preset))
+    about = describe_network(OnnxSettings(model=path, preset=preset)).to_json()
     assert about["trained_on"] == PRESETS[preset].trained_on
     assert len(about["sha256"]) == 64
     other = {"hitnet": "lite-any-stereo", "lite-any-stereo": "hitnet"}[preset]
