@@ -235,13 +235,6 @@ def test_a_costmap_of_tiles_lies_on_the_grid_and_has_the_robot_in_it(mapped, fol
     assert folder.path("map/costmap.png").exists()
 
 
-def test_smaller_tiles_make_the_same_costmap(mapped):
-    whole = load_config(None, [*SETTINGS, "submaps.tile_m=200"])
-    ours, _ = make_costmap(mapped.map, mapped.placed)
-    theirs, _ = make_costmap(mapped.map, place_map(mapped.map, whole))
-    assert (ours.cells != theirs.cells).mean() < 0.001
-
-
 def test_a_costmap_without_rays_or_for_a_robot_flatter_than_ground_is_refused(mapped):
     low = load_config(None, [*SETTINGS, "robot.clearance_m=0.2"])
     with pytest.raises(MappingError, match=r"clearance_m=0.2.*grid.min_height_m=0.3"):

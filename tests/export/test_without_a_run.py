@@ -10,7 +10,6 @@ import recon
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError, SourceError
 from recon.export.make import PRODUCTS, make
 from recon.export.product import Order
-from recon.io.models import nav2
 from recon.io.models.octomap import read_octomap
 from tests.map import walls
 
@@ -158,19 +157,6 @@ def test_a_folder_that_is_not_empty_a_file_and_a_link_are_no_place_for_a_folder(
         "metadata.yaml",
     ]
     assert names_in(tmp_path) == ["empty", "full", "link"]
-
-
-def test_an_error_leaves_what_was_there_and_nothing_beside_it(mapped, tmp_path, monkeypatch):
-    (tmp_path / "a.yaml").write_text("old")
-    fail = OSError(28, "No space left on device")
-
-    def full(*_: object) -> None:
-        raise fail
-
-    monkeypatch.setattr(nav2, "write_text", full)
-    with pytest.raises(OutputError, match=r"a\.yaml.*No space left"):
-        recon.export_map(mapped, "grid", tmp_path / "a.yaml")
-    assert files_in(tmp_path) == {"a.yaml": b"old"}
 
 
 @pytest.mark.parametrize(

@@ -112,20 +112,6 @@ def test_an_error_inside_is_reported_and_kept_as_the_cause(blind):
         odometry.restore({"odometry": {"own": {}, "begun": True}, "last": None})
 
 
-@pytest.mark.parametrize("method", ["register", "state", "restore"])
-def test_an_odometry_that_exits_ends_nothing(method, blind):
-    class Exiting(Ahead):
-        pass
-
-    def leave(*_: object) -> None:
-        raise SystemExit(0)
-
-    setattr(Exiting, method, leave)
-    odometry, given = ForeignOdometry(Exiting(), "mine"), {"register": [blind()], "state": []}
-    with pytest.raises(RegistrationError, match=r"'mine'.*fails.*SystemExit: 0"):
-        getattr(odometry, method)(*given.get(method, [{"own": {}, "begun": True}]))
-
-
 @pytest.mark.parametrize(
     "state", [None, [1], {1: 2}, {"a": {3}}, {"a": np.array(["x"])}, {"a": [{"b": object()}]}]
 )
@@ -203,23 +189,6 @@ def test_a_registered_odometry_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
     install_plugin(tmp_path, "other", {}, {"ahead": "other:Ahead"}, "odometries")
     with pytest.raises(SettingsError, match=r"same name.*go-ahead.*and.*other"):
         make_odometry("ahead")
-
-
-@pytest.mark.usefixtures("plugin")
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("missing", "does not load.*AttributeError.*Nowhere"),
-        ("gone", "does not load.*ModuleNotFoundError.*not_there"),
-        ("nothing", "makes no odometry.*int.*register"),
-        ("fails", "does not load.*RuntimeError: no model here"),
-    ],
-)
-def test_a_broken_plugin_is_named_in_one_line(name, words):
-    with pytest.raises(SettingsError, match=words) as raised:
-        make_odometry(name)
-    assert f"odometry {name!r}" in str(raised.value)
-    assert "of package go-ahead" in str(raised.value)
 
 
 @pytest.mark.usefixtures("plugin", "blank_figures")

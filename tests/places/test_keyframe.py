@@ -225,8 +225,3 @@ def test_a_motion_is_found_among_four_times_as_many_wrong_matches(seed):
     assert found.agree[~right].mean() < 0.1
     wrong = find_motion(*(_seen(xyz[~right]) for xyz in (first_xyz, last_xyz)))
     assert wrong is None or wrong.agree.sum() < MIN_INLIERS
-
-
-def test_points_of_pixels_project_back_onto_them():
-    uvd = np.array([[10.0, 20.0, 5.0], [300.0, 100.0, 30.0]])
-    assert np.column_stack(project(points_of(uvd, CAMERA), CAMERA)) == pytest.approx(uvd, rel=1e-5)

@@ -10,7 +10,6 @@ import pytest
 from recon.core.errors import ReconError, SourceError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera, StereoCalibration
-from recon.io.cameras.ros import are_rectified
 from recon.io.images.video import VideoFile
 from recon.sources.bag import rig_of_messages
 from recon.sources.registry import open_source
@@ -180,13 +179,6 @@ def test_the_baseline_is_between_the_cameras_wherever_both_measure_from(rectifie
         rig_of_messages(*infos[::-1], Path("drive.bag"), rectified)
 
 
-def test_rectified_messages_of_two_focal_lengths_are_refused():
-    left, right = (np.array([[f, 0, 31.5, x], [0, f, 15.5, 0], [0, 0, 1, 0]])
-                   for f, x in ((60.0, 0.0), (61.0, -30.0)))  # fmt: skip
-    with pytest.raises(ReconError, match=r"drive\.bag: P of the left and P of the right have diff"):
-        rig_of_messages(info_of(left), info_of(right), Path("drive.bag"), rectified=True)
-
-
 VIEW = RectifiedCamera(72.0, 61.0, 17.3, 61.0, 0.54, 124, 37)
 RAW = {"K": [98.4, 0, 69.0, 0, 98.4, 23.3, 0, 0, 1], "D": [-0.37, 0.2, 0.002, 0.001, -0.07]}
 RAW_TOPICS = ("/kitti/left/image_raw", "/kitti/right/image_raw")
@@ -220,17 +212,6 @@ def test_images_of_the_lens_are_raw_though_their_projection_fits_as_well(tmp_pat
     source = recorded(tmp_path, size, np.zeros((51, 139), np.uint8), **RAW)
     assert isinstance(source.calibration, StereoCalibration)
     assert (len(list(source)), source.warnings()) == (1, [])
-
-
-def test_a_sensor_that_is_read_off_its_centre_stays_raw(tmp_path):
-    """The projection is off by as much, since it shows what the lens shows."""
-    K, P = ([f, 0, 61.0, *last, 0, f, 26.0, *last, 0, 0, 1, *last]
-            for f, last in ((98.4, []), (90.0, [0.0])))  # fmt: skip
-    right = [*P[:3], -49.0, *P[4:]]
-    assert not are_rectified(
-        (np.reshape(K, (3, 3)),) * 2, (np.reshape(P, (3, 4)), np.reshape(right, (3, 4))),
-        (124, 37), (124, 37),
-    )  # fmt: skip
 
 
 def test_images_of_half_the_size_of_their_calibration_are_still_refused(tmp_path):

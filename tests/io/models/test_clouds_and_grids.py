@@ -154,17 +154,6 @@ def test_other_clouds_are_read_without_what_is_not_finite_or_no_confidence(tmp_p
     assert read_ply(path).confidence is None
 
 
-@pytest.mark.parametrize("ascii", [False, True])
-def test_a_truncated_cloud_is_refused(tmp_path, ascii):  # noqa: A002
-    path = tmp_path / "cloud.ply"
-    write_ply(path, example_cloud(), ascii=ascii)
-    whole = path.read_bytes()
-    for cut in (40 if ascii else 1, 300):
-        path.write_bytes(whole[:-cut])
-        with pytest.raises(FormatError, match="truncated"):
-            read_ply(path)
-
-
 def test_a_header_of_more_than_memory_and_coordinates_that_would_become_steps_are_refused(tmp_path):
     path = write_raw(tmp_path / "a.ply", XYZ, b"\0" * 24, 10**15, kind="binary_little_endian")
     with pytest.raises(FormatError, match="truncated"):

@@ -17,7 +17,6 @@ from recon.map.drive import drive_loops
 from recon.map.drive.drive import MapBehind
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import doubt_poses
-from recon.map.drive.sequence import map_sequence
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.settings import DriveSettings
 from recon.map.store.records import Store
@@ -72,15 +71,6 @@ def test_poses_of_a_body_are_recognised(street):
     poses = T_BODY_CAMERA @ street.trajectory.T_world_camera @ invert(T_BODY_CAMERA)
     (line,) = doubts(street, poses)
     assert "as those of a body" in line
-
-
-def test_frames_that_show_nothing_before_the_first_change_no_axes(street):
-    dark = street.taken(slice(0, 2), np.zeros_like)
-    late = Film([*dark.pairs, *street.pairs], street.calibration, np.tile(np.eye(4), (10, 1, 1)))
-    seen, waited = (map_sequence(source, DriveSettings()) for source in (street, late))
-    np.testing.assert_array_equal(waited.T_map_world, seen.T_map_world)
-    assert [(one.first, one.last) for one in waited.sessions] == [(2, 9)]
-    assert len(waited.cloud) == len(seen.cloud)
 
 
 GREY = np.zeros((16, 16), np.uint8)

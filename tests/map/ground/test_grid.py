@@ -332,15 +332,6 @@ def test_the_ground_is_found_among_walls_and_boxes(pitch, roll):
         assert abs(T[1, 2]) < 0.03
 
 
-def test_walls_ceilings_and_nothing_are_no_ground():
-    rng = np.random.default_rng(1)
-    x, y = rng.uniform(-5, 5, 8000), rng.uniform(-2, 2, 8000)
-    wall = np.stack([x, y, np.full(8000, 6.0)], 1)
-    ceiling = np.stack([x, np.full(8000, -1.5), rng.uniform(4, 15, 8000)], 1)
-    for xyz in (wall, ceiling, np.zeros((0, 3))):
-        assert estimate_ground(PointCloud(xyz.astype(np.float32))) is None
-
-
 CAMERA_M = 1.6
 PATH = np.stack([np.arange(0, 60, 1.0), np.zeros(60), np.zeros(60)], axis=1)
 
@@ -467,16 +458,6 @@ def _joined(*parts: tuple[np.ndarray, np.ndarray]) -> OccupancyVoxels:
 
 
 ROAD = _columns(range(20), range(5), {-8: 2.0, -7: -1.0, -6: -1.0})
-WALL = _columns(range(20), range(5, 6), dict.fromkeys(range(-8, 4), 2.0))
-
-
-def test_floors_are_occupied_voxels_below_free_ones():
-    added = add_floors(NOTHING, find_floors(_joined(ROAD, WALL)))
-    none = OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), EDGE_M)
-    assert len(find_floors(none)) == len(add_floors(NOTHING, find_floors(none))) == 0
-    assert (len(added), added.xyz[:, 2]) == (100, pytest.approx(-7.5 * EDGE_M))
-    assert added.xyz[:, 1].max() < 1.0
-    assert (added.normals == [0, 0, 1]).all()
 
 
 def test_a_floor_may_share_its_evidence_with_the_voxel_above():
