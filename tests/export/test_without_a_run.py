@@ -5,9 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 import recon
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError, SourceError
+from recon.core.geometry.se3 import apply
+from recon.core.kernels.voxels import pack_keys
 from recon.export.make import PRODUCTS, make
 from recon.export.product import Order
 from recon.io.models.octomap import read_octomap
@@ -77,10 +80,17 @@ def test_a_suffix_chooses_among_the_formats_of_a_product(mapped, tmp_path, name,
     recon.export_map(mapped, name, tmp_path / f"a.b{end}")
     assert [path.name for path in tmp_path.iterdir()] == [f"a.b{end}"]
     if name == "octomap":
-        assert len(read_octomap(tmp_path / "a.b.ot")) > 100
+        found = pack_keys(read_octomap(tmp_path / "a.b.ot").keys)
+        assert len(found) > 10_000
+        assert np.isin(found, pack_keys(mapped.voxels.keys)).all()
     else:
         (tmp_path / f"a.b{end}").rename(tmp_path / f"c{end.lower()}")
-        assert len(recon.read_mesh(tmp_path / f"c{end.lower()}").faces) > 100
+        mesh = recon.read_mesh(tmp_path / f"c{end.lower()}")
+        xyz = apply(mapped.T_map_world, mapped.cloud.xyz)
+        apart_m = cKDTree(xyz).query(mesh.vertices)[0]
+        # Points are 0.1 m apart.
+        assert np.median(apart_m) < 0.05
+        assert apart_m.max() < 0.3
 
 
 def test_a_grid_that_is_read_is_the_one_that_was_made_also_with_other_settings(mapped, tmp_path):

@@ -219,7 +219,8 @@ def test_points_and_voxels_that_are_put_in_come_out(store):
     # A tile without points takes nothing from the others.
     far = OccupancyVoxels(np.int32([[40, 3, 0]]), np.ones(1, np.float32), filled.resolution_m)
     put_voxels(filled, far)
-    assert filled.cloud_in(EVERYWHERE).sigma_m is not None
+    sigma_m = filled.cloud_in(EVERYWHERE).sigma_m
+    np.testing.assert_array_equal(np.sort(sigma_m), np.sort(cloud.sigma_m))
 
 
 def test_a_path_that_leaves_a_rectangle_and_comes_back_is_in_pieces():

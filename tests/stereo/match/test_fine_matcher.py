@@ -66,9 +66,10 @@ def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
     plain = np.s_[45:75, 125:140]  # seen without texture in both views
     error = np.abs(found.values - truth)
     filled = found.reason == Reason.FILLED
-    assert filled[plain].mean() > 0.1
+    # Half of it is reached by features of a wide surround, and measured; a fifth is filled.
+    assert 0.15 < filled[plain].mean() < 0.3
+    assert not filled[85:, 60:].any()
     assert (error[plain][filled[plain]] < 1).mean() > 0.95
-    assert filled[45:75, 125:140].mean() > filled[85:, 60:].mean()
     only = sgm.SgmMatcher(sgm.SgmSettings(ndisp=48)).match(pair)
     assert (np.abs(only.values - truth)[plain] < 1).mean() < 0.3
     seen = found.reason == Reason.VALID

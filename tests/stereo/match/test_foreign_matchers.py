@@ -243,7 +243,8 @@ def test_nothing_is_matched_beside_the_right_image_without_an_image_or_padding(n
 def test_what_opencv_could_not_match_is_nan_with_a_reason_and_tiny_images_no_error(name):
     left, right = np.random.default_rng(5).integers(0, 256, (2, 60, 160), dtype=np.uint8)
     disparity = match(name, RectifiedPair(left, right, stand_in_camera(160, 60, 32)))
-    assert np.isnan(disparity.values).mean() > 0.5
+    # Chance matches some 9 % of noise.
+    assert 0.85 < np.isnan(disparity.values).mean() < 0.95
     assert Reason.AMBIGUOUS in disparity.reason
     assert not (disparity.values < 0).any()
     for height, width in ((1, 1), (1, 40), (40, 1), (3, 3)):
