@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from recon.core.errors import CalibrationError, FormatError, ReconError
-from recon.core.geometry.se3 import apply, exp_so3, make_transform
+from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
 from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import list_kitti_cameras, read_kitti_calib, read_kitti_offset
@@ -549,3 +549,24 @@ def test_a_file_without_a_size_is_refused_if_its_centre_cannot_be_that_of_the_im
     message = r"another size .*principal point at \(70\.5, 21\.5\) of 71x22 pixels.*stores the size"
     with pytest.raises(CalibrationError, match=message):
         read_calibration(path, 71, 22)
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_a_rig_with_left_and_right_swapped_is_refused_as_a_pair_would_be(form, tmp_path):
+    given = rig("none")
+    swapped = StereoCalibration(given.right, given.left, invert(given.T_right_left))
+    path = tmp_path / "rig_left.yaml"
+    if form == "ros":  # whose rectification knows no such rig
+        left, right = write_ros(path, given)
+        left.rename(tmp_path / "third")
+        right.rename(left)
+        (tmp_path / "third").rename(right)
+    else:
+        WRITERS[form](path, swapped)
+    with pytest.raises(CalibrationError, match=r"rig_.*right camera is to the left.*swap"):
+        read_calibration(path)
+    vertical = replace(given, T_right_left=make_transform(np.eye(3), np.array([0.01, -0.12, 0])))
+    if form != "ros":
+        WRITERS[form](path, vertical)
+        with pytest.raises(CalibrationError, match=r"not side by side.*rotate the images"):
+            read_calibration(path, 640, 480)
