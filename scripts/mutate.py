@@ -144,13 +144,14 @@ def choose(rooms: list[str], count: int, seed: int) -> list[Change]:
 
 
 def tests_of(change: Change) -> list[str]:
-    """Return the test files of a room, those that name the changed module first."""
+    """Return the test files that name the changed module, of any room, then the others of its."""
     room = change.path.parts[1]
     folders = TESTS.get(room, (room,))
-    files = [path for name in folders for path in (ROOT / "tests" / name).rglob("test_*.py")]
     module = ".".join(change.path.with_suffix("").parts)
-    files.sort(key=lambda path: (module not in path.read_text(), str(path)))
-    return [str(path.relative_to(ROOT)) for path in files]
+    every = sorted((ROOT / "tests").rglob("test_*.py"))
+    naming = [path for path in every if module in path.read_text()]
+    near = [path for path in every if path.relative_to(ROOT).parts[1] in folders]
+    return [str(path.relative_to(ROOT)) for path in dict.fromkeys([*naming, *near])]
 
 
 def notices(change: Change, copy: Path) -> bool:

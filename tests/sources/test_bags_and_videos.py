@@ -309,7 +309,8 @@ def test_a_video_may_end_a_little_earlier(noise, tmp_path, shorter):
     drives.write_video(tmp_path / f"{shorter}.avi", views[:-1])
     source = open_source(tmp_path)
     assert source.left_out == 1
-    assert "1 right" in source.description or "1 left" in source.description
+    assert source.description.startswith("two videos, 10 Hz, paired frame by frame")
+    assert f"1 {'right' if shorter == 'left' else 'left'}" in source.description
     assert len(list(source)) == len(source) == 23
     drives.write_video(tmp_path / f"{shorter}.avi", views[:-2])
     fails(tmp_path, r"different numbers of frames \(got left 2[24], right 2[24]\)")
@@ -357,7 +358,9 @@ def test_views_may_stand_in_any_order_in_one_video(noise, tmp_path, layout, flip
     images = [[p.left, p.right][:: -1 if flip else 1] for p in noise]
     drives.write_calib(tmp_path, CAMERA)
     path = drives.write_video(tmp_path / "both.avi", [stack(both) for both in images])
-    read = list(open_source(path, settings=SourceSettings(side_by_side=layout)))  # type: ignore[arg-type]
+    source = open_source(path, settings=SourceSettings(side_by_side=layout))  # type: ignore[arg-type]
+    assert source.description.startswith(f"{layout} in one video, 10 Hz")
+    read = list(source)
     np.testing.assert_array_equal(read[3].left[:, :, 0], noise[3].left)
     np.testing.assert_array_equal(read[3].right[:, :, 0], noise[3].right)
 
