@@ -106,17 +106,6 @@ def test_a_grid_that_is_read_is_the_one_that_was_made_also_with_other_settings(m
     assert (other.cells == recon.core.values.OCCUPIED).sum() < (back.cells == 100).sum()
 
 
-def test_a_map_of_a_file_gives_what_it_gave_in_memory(mapped, tmp_path):
-    with walls.drives(1) as map_, recon.Map.create(tmp_path / "map.recon") as kept:
-        walls.drive(kept, walls.TRUE[0], 0)
-        kept.commit()
-        for number, one in enumerate((map_, kept)):
-            recon.export_map(one, "cloud", tmp_path / f"{number}.ply")
-        with pytest.raises(OutputError, match="another kind of file"):
-            recon.export_map(kept, "cloud", tmp_path / "map.recon")
-    assert (tmp_path / "0.ply").read_bytes() == (tmp_path / "1.ply").read_bytes()
-
-
 def test_a_file_is_replaced_and_an_input_or_a_folder_is_not(mapped, tmp_path):
     (tmp_path / "a.ply").write_text("old")
     recon.export_map(mapped, "cloud", str(tmp_path / "a.ply"))

@@ -249,12 +249,6 @@ def _fused(*clouds: PointCloud, least: int = 1) -> PointCloud:
     return _part(*clouds).cloud(0.1, least)
 
 
-def test_voxels_seen_too_rarely_are_not_exported():
-    clouds = [_cloud([HERE, ELSEWHERE]), _cloud(HERE), _cloud(HERE)]
-    assert _fused(*clouds, least=3).xyz.tolist() == pytest.approx(np.float32([HERE]))
-    assert len(_fused(*clouds)) == 2
-
-
 def test_precise_voxels_need_one_frame_less(monkeypatch):
     # Two frames of 0.1 m make 0.071 m, two of 0.15 m make 0.106 m.
     cloud = _cloud([HERE, ELSEWHERE], sigma_m=np.float32([0.1, 0.15]))

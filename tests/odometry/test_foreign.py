@@ -5,10 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import recon
-from recon.cli import app
 from recon.core.errors import RegistrationError, SettingsError
 from recon.odometry.foreign import ForeignOdometry
 from recon.odometry.registry import ODOMETRIES, make_odometry
@@ -205,13 +203,3 @@ def test_a_drive_is_mapped_with_a_plugin_and_results_name_it(tmp_path):
     with pytest.raises(RegistrationError, match=r"odometry 'worse', frame 0: .*no rigid pose.*nan"):
         recon.run_map(source, recon.load_config(overrides=["odometry.method=worse"]), bad)
     assert not (tmp_path / "bad").exists()
-
-
-def test_the_command_line_lists_the_choices(tmp_path):
-    from tests.scenery.kitti import street_drive
-
-    drive = street_drive(tmp_path / "d", 2, 64)
-    done = CliRunner().invoke(app, ["map", str(drive), "--odometry", "orb", "--quiet"])
-    assert done.exit_code == 1
-    assert done.stderr.startswith("error: unknown odometry (got 'orb', expected one of: kiss, sfm,")
-    assert done.stderr.count("\n") == 1

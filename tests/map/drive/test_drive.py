@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.core.errors import MappingError, OutputError, RegistrationError
+from recon.core.errors import MappingError, RegistrationError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import Disparity, PointCloud, RectifiedCamera, RectifiedPair, Trajectory
 from recon.core.values.arrays import Float64
@@ -24,7 +24,7 @@ from recon.map.store.session import Keyframes
 from recon.odometry.protocol import OdometryHealth, OdometryResult
 from recon.places import places
 from recon.places.closure import DrivePath, close_loops
-from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
+from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.stereo.frame import ReconstructedFrame
 from recon.street.settings import StreetScene
 from tests.run.pools import observed_pool
@@ -240,15 +240,6 @@ def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, che
     assert np.array_equal(
         loops.closure.trajectory.T_world_camera, closed.closure.trajectory.T_world_camera
     )
-
-
-def test_a_full_disk_is_reported_although_another_thread_met_it(frames, tmp_path, monkeypatch):
-    def full(self: Keyframes, stored: StoredKeyframe) -> None:
-        raise OutputError("the disk is full")
-
-    monkeypatch.setattr(Keyframes, "put", full)
-    with pytest.raises(OutputError, match="full"):
-        _watch(frames, _circle(), upto=1)
 
 
 def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):

@@ -387,14 +387,6 @@ def test_slopes_are_followed():
     assert of_one_frame.height_at(np.array([[33.0, 2.0]]))[0] == pytest.approx(height_m, abs=0.1)
 
 
-def test_what_is_beyond_the_reach_or_has_no_ground_is_unknown():
-    surface = _surface(_hill(), reach_m=5.0)
-    assert np.isnan(surface.height_at(np.array([[30.0, 9.0], [1e4, -1e4]]))).all()
-    nothing = _surface(np.zeros((0, 3)))
-    assert np.isnan(nothing.heights_m).all()
-    assert math.isnan(nothing.camera_height_m)
-
-
 def test_boxes_and_walls_do_not_lift_the_ground():
     rng = np.random.default_rng(1)
     x, y = rng.uniform(10, 16, 20_000), rng.uniform(3, 6, 20_000)
@@ -430,15 +422,6 @@ def test_heights_are_carried_over_small_gaps_alone(monkeypatch):
     surface = _surface(points[~large])
     assert np.isnan(surface.height_at(np.array([[30.0, 9.5], [30.0, -9.5]]))).all()
     assert np.isfinite(surface.height_at(np.array([[30.0, 2.0], [30.0, -2.0]]))).all()
-
-
-def test_height_is_linear_between_centres_of_cells():
-    surface = GroundSurface(np.array([[0.0, 1.0], [2.0, np.nan]]), 1.0, (10.0, 20.0))
-    places = np.array([[10.5, 20.5], [11.0, 20.5], [10.5, 21.0], [11.5, 21.5], [10.0, 20.0]])
-    heights = surface.height_at(places)
-    assert heights[:3].tolist() == [0.0, 0.5, 1.0]
-    assert math.isnan(heights[3])
-    assert heights[4] == 0.0  # outside of the centres: the nearest cell's
 
 
 EDGE_M = 0.2

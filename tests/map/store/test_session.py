@@ -203,16 +203,6 @@ def test_a_finished_map_gives_cloud_and_occupancy_again(tmp_path, closed):
         PlacedSubmaps(lacking, CONFIG)
 
 
-def test_submaps_move_with_their_middle_frames():
-    session = drives(1).session()
-    assert session.corrections() is None
-    path = session.odometry.T_world_camera
-    bent = np.stack([BEND @ T if n % 2 else T for n, T in enumerate(path)])
-    session.set_loops({"closed": [], "refused": [], "T_world_camera": bent})
-    for entry, T in zip(session.submaps.entries, session.corrections(), strict=True):
-        np.testing.assert_allclose(T @ path[entry.middle], bent[entry.middle], atol=1e-9)
-
-
 def test_the_rig_of_a_drive_is_known_to_later_ones_of_the_same_calibration(tmp_path):
     raw, count = as_raw(CAMERA), len(NAMES)
     other = replace(CAMERA, baseline_m=2.0)
