@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 """Change one token at random, run the tests of that room, and count how many changes they notice.
 
-An operator, a comparison (into its opposite), `and`, `or` or `not` outside kernels is changed in a
-copy of the project, so the checkout stays as it is. What no test notices is printed.
+Outside kernels an operator, a comparison (into its opposite), `and`, `or`, `not`, a number (by one)
+or the condition of an `if` (into its opposite) is changed, or a value is not returned: in a copy of
+the project, so the checkout stays as it is. What no test notices is printed.
 
     scripts/mutate.py --count 100 --seed 1
-    scripts/mutate.py --room stereo --count 8
+    scripts/mutate.py --room io core map/store --count 60
 """
 
 from __future__ import annotations
@@ -76,12 +77,30 @@ def changes_of(path: Path) -> Iterator[Change]:
     for node in ast.walk(tree):
         if id(node) in hints:
             continue
+        yield from _rewritten(path, text, starts, node)
         for op, begin, end in _operators(node):
             old, new = OTHER.get(type(op), ("", ""))
             first = starts[begin[0] - 1] + begin[1]
             at = text.find(old.encode(), first, starts[end[0] - 1] + end[1]) if old else -1
             if at >= 0:
                 yield Change(path, text.count(b"\n", 0, at) + 1, at, old, new)
+
+
+def _rewritten(path: Path, text: bytes, starts: list[int], node: ast.AST) -> Iterator[Change]:
+    """Yield what becomes of a number, of the condition of an `if` and of a returned value."""
+    form = "{}"
+    part: ast.expr | None = None
+    if isinstance(node, ast.Constant) and type(node.value) in {int, float}:
+        form, part = "({} + 1)", node
+    elif isinstance(node, ast.If | ast.IfExp):
+        form, part = "(not ({}))", node.test
+    elif isinstance(node, ast.Return) and not isinstance(node.value, ast.Constant | None):
+        form, part = "None", node.value
+    if part is not None:
+        begin, end = _begin(part), _end(part)
+        first, last = starts[begin[0] - 1] + begin[1], starts[end[0] - 1] + end[1]
+        old = text[first:last].decode()
+        yield Change(path, begin[0], first, old, form.format(old))
 
 
 def _annotations(tree: ast.AST) -> Iterator[ast.AST]:
@@ -116,29 +135,30 @@ def _end(node: ast.AST) -> tuple[int, int]:
     return node.end_lineno, node.end_col_offset  # type: ignore[attr-defined]
 
 
-def choose(room: str | None, count: int, seed: int) -> list[Change]:
+def choose(rooms: list[str], count: int, seed: int) -> list[Change]:
     """Choose changes, each with the same chance."""
-    files = sorted((ROOT / "recon" / (room or "")).rglob("*.py"))
+    files = sorted({path for room in rooms for path in (ROOT / "recon" / room).rglob("*.py")})
     inside = [path.relative_to(ROOT) for path in files if "kernels" not in path.parts]
     every = [change for path in inside for change in changes_of(path)]
     return random.Random(seed).sample(every, min(count, len(every)))
 
 
 def tests_of(change: Change) -> list[str]:
-    """Return the test files of a room, those that name the changed module first."""
+    """Return the test files that name the changed module, of any room, then the others of its."""
     room = change.path.parts[1]
     folders = TESTS.get(room, (room,))
-    files = [path for name in folders for path in (ROOT / "tests" / name).rglob("test_*.py")]
     module = ".".join(change.path.with_suffix("").parts)
-    files.sort(key=lambda path: (module not in path.read_text(), str(path)))
-    return [str(path.relative_to(ROOT)) for path in files]
+    every = sorted((ROOT / "tests").rglob("test_*.py"))
+    naming = [path for path in every if module in path.read_text()]
+    near = [path for path in every if path.relative_to(ROOT).parts[1] in folders]
+    return [str(path.relative_to(ROOT)) for path in dict.fromkeys([*naming, *near])]
 
 
 def notices(change: Change, copy: Path) -> bool:
     """Run the tests of a room on a copy of the project in which one token is changed."""
     path = copy / change.path
     text, stat = path.read_bytes(), path.stat()
-    end = change.start + len(change.old)
+    end = change.start + len(change.old.encode())
     path.write_bytes(text[: change.start] + change.new.encode() + text[end:])
     # Byte code of a file is recognised by its time in whole seconds.
     os.utime(path, (stat.st_atime, stat.st_mtime + 60))
@@ -164,7 +184,7 @@ def notices(change: Change, copy: Path) -> bool:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--room", help="folder of recon/; all by default")
+    parser.add_argument("--room", nargs="+", default=[""], help="folders of recon/; all by default")
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()

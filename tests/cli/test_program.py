@@ -7,8 +7,12 @@ from typing import Any
 import pytest
 
 from recon.cli.program import _NOT_OPTIONS, COMMANDS, _command, plan_jobs
-from recon.cli.tables import print_batch, print_figures, print_remarks, print_rows
-from recon.commands import config
+from recon.cli.tables import (
+    print_batch,
+    print_figures,
+    print_remarks,
+    print_rows,
+)
 from recon.commands.batch import BatchSummary
 from recon.commands.map_pieces import Piece, piece_job
 from recon.core.errors import SettingsError
@@ -109,16 +113,6 @@ def test_a_sweep_spreads_every_job_over_every_combination_of_right_values():
     assert jobs[7].swept == {"matching.sad.window_px": 11, "matching.matcher": "sgm"}
     with pytest.raises(SettingsError, match=r"job a: .*matching\.sad\.window_px"):
         plan(DRIVE, matching__sad__window_px=[9, 11, "much"])
-
-
-def test_of_a_large_sweep_each_value_is_checked_once(monkeypatch):
-    checked: list[Any] = []
-    load = config.load_config
-    monkeypatch.setattr(config, "load_config", lambda *words: checked.append(words) or load(*words))
-    windows, frames = [5, 7, 9, 11, 13], [*range(1, 601)]
-    jobs = plan(DRIVE, matching__sad__window_px=windows, checkpoints__every_frames=frames)
-    assert len(jobs) == 5 * 600
-    assert len(checked) == 5 + 600 - 1
 
 
 TWO = {"command": "evaluate disparity", "source": ["a", "b"]}

@@ -147,18 +147,6 @@ def test_a_charuco_board_of_the_older_pattern_is_found_out(tmp_path):
         np.testing.assert_allclose(left.pixels, placed.left_px[left.numbers], atol=0.5)
 
 
-@pytest.mark.parametrize("name", ["rig.yaml", "camera_info.yaml"])
-def test_a_calibration_that_is_interrupted_leaves_nothing(drawn, tmp_path, monkeypatch, name):
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("recon.commands.cameras.write_calibration_page", interrupt)
-    sides = (str(drawn / "left0*.png"), str(drawn / "right0*.png"))
-    with pytest.raises(KeyboardInterrupt):
-        run_calibrate(*sides, BOARD, load_config(), file=tmp_path / name, out=tmp_path / "out")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_folder_for_a_calibration_file_is_refused(drawn, tmp_path):
     (tmp_path / "rig.yaml").mkdir()
     with pytest.raises(OutputError, match="calibration file is a folder"):

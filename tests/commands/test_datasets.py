@@ -111,20 +111,6 @@ def test_a_part_of_which_one_archive_is_not_that_of_the_list_does_not_appear(mir
     assert not (tmp_path / "kitti-raw").exists()
 
 
-def test_flights_are_taken_out_of_their_archive(mirror, tmp_path, monkeypatch):
-    flight = zipped({"mav0/cam0/data.csv": b"#", "__MACOSX/._mav0": b"x"})
-    content = zipped({"vicon_room1/V1_01/V1_01.zip": flight, "vicon_room1/V1_01/V1_01.bag": b"x"})
-    mirror.files["/vicon_room1.zip"] = content
-    facts = datasets()["euroc"].files["vicon_room1.zip"]
-    digest = f"md5:{hashlib.md5(content).hexdigest()}"  # noqa: S324
-    smaller = facts.model_copy(update={"bytes": len(content), "digest": digest})
-    monkeypatch.setitem(datasets()["euroc"].files, "vicon_room1.zip", smaller)
-    run_fetch(["euroc/vicon_room1"], tmp_path, address=mirror.address)
-    place = tmp_path / "euroc" / "vicon_room1"
-    assert (place / "V1_01" / "mav0" / "cam0" / "data.csv").read_bytes() == b"#"
-    assert sorted(path.name for path in place.iterdir()) == ["V1_01", RECORD]
-
-
 def test_a_hash_beside_the_archive_is_compared(mirror, tmp_path):
     name = "dataset-room1_512_16"
     content = tarred(f"{name}/mav0/cam0/data.csv", b"#")

@@ -2,7 +2,6 @@
 
 import fcntl
 import json
-import subprocess
 import sys
 import threading
 from typing import Any
@@ -14,7 +13,7 @@ from recon.commands import kernels
 from recon.commands.config import ReconConfig
 from recon.commands.kernels import Call, compile_kernels, missing_calls, recorded_calls, signature
 from recon.core.kernels.cache import when_compiling
-from recon.core.kernels.compiled import CACHE, _KernelCache
+from recon.core.kernels.compiled import CACHE
 from recon.core.progress import Progress, showing
 
 compiled = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="kernels are not compiled")
@@ -27,19 +26,6 @@ def test_recorded_calls_are_of_kernels_that_are_there_with_types_that_numba_know
     for call in calls:
         kernel = kernels.kernel_of(call)
         assert kernel.__code__.co_argcount == len(signature(call))
-
-
-def test_a_matcher_needs_some_kernels_a_drive_others():
-    every = recorded_calls()
-    needed = {
-        name: {json.dumps(call) for call in every if name in call.needed_by}
-        for name in ("sad", "fine", "map", "demo")
-    }
-    assert all(needed.values())
-    assert needed["demo"] - needed["map"]  # those of rendering
-    assert needed["map"] - needed["demo"]  # nothing moves in it
-    assert needed["map"] & needed["demo"]
-    assert needed["fine"] - needed["demo"]
 
 
 @compiled
@@ -83,20 +69,6 @@ def test_each_kernel_that_lacks_is_counted_and_said(lacking):
         assert compile_kernels("map") == 2
     assert shown.told == [(2, "kernels"), "one", "one"]
     assert sorted(said) == sorted(call.name for call in lacking)
-
-
-def test_nothing_starts_where_nothing_lacks(monkeypatch):
-    monkeypatch.setattr(kernels, "missing_calls", lambda *_: [])
-    monkeypatch.setattr(subprocess, "Popen", None)
-    assert compile_kernels("map") == 0
-
-
-@compiled
-def test_where_kernels_are_not_compiled_none_lacks(monkeypatch):
-    monkeypatch.setattr(_KernelCache, "holds", lambda *_: False)
-    assert len(missing_calls()) == len(recorded_calls())
-    monkeypatch.setattr(kernels.config, "DISABLE_JIT", 1)
-    assert missing_calls() == []
 
 
 @compiled

@@ -59,6 +59,7 @@ def test_known_poses_of_the_lens_become_those_of_the_rectified_camera(tmp_path, 
     np.testing.assert_allclose(poses[:, :3, 3], raw.T_world_camera[:, :3, 3], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_path_and_map_are_those_of_one_run():
     source = film(STREET)
     config = load_config(None, ["submaps.length_m=4", "submaps.tile_m=12.8"])

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.core.errors import ShapeError
+from recon.core.errors import FormatError, ShapeError
 from recon.core.geometry import se3
 from recon.core.geometry.alignment import Similarity, find_agreeing, fit_paths, fit_points
 from recon.core.open3d_raycasting import RayScene
@@ -146,6 +146,38 @@ def test_half_a_turn_has_an_axis_and_a_quaternion(axis):
     assert np.linalg.norm(w) == pytest.approx(math.pi)
     np.testing.assert_allclose(se3.exp_so3(w), R, atol=1e-12)
     np.testing.assert_allclose(np.abs(se3.quaternion_from_rotation(R)[:3]), axis, **EXACT)
+
+
+def moved(x_m: float = 0.0, scale: float = 1.0, last: float = 1.0) -> np.ndarray:
+    T = np.diag([scale, 1.0, 1.0, last])
+    T[0, 3] = x_m
+    return T
+
+
+@pytest.mark.parametrize(
+    "T",
+    [
+        moved(1.01e5),
+        moved(np.nan),
+        moved(scale=1.01),
+        moved(scale=-1.0),
+        moved(last=2.0),
+        np.eye(3),
+    ],
+)
+def test_a_pose_that_is_read_and_is_none_is_refused(T):
+    se3.check_rigid("T_map_world", moved(0.99e5))
+    with pytest.raises(FormatError, match="T_map_world is not a rigid transform"):
+        se3.check_rigid("T_map_world", T)
+
+
+def test_an_uncertain_step_has_the_square_of_its_deviations_and_what_nothing_fixes_100_m():
+    covariance = se3.step_covariance(0.2, 3.0)
+    angle = np.deg2rad(3.0) ** 2
+    np.testing.assert_allclose(covariance, np.diag([0.04] * 3 + [angle] * 3), rtol=1e-12)
+    back = se3.covariance_of(np.linalg.inv(covariance))
+    np.testing.assert_allclose(back, covariance, rtol=1e-5)
+    np.testing.assert_allclose(se3.covariance_of(np.zeros((6, 6))), 100**2 * np.eye(6))
 
 
 def points(seed: int, n: int = 40) -> np.ndarray:

@@ -13,7 +13,6 @@ from recon.core.errors import MissingDependencyError, ReconError, SettingsError,
 from recon.core.machine import parse_size_mb
 from recon.core.settings import Settings
 from recon.core.text import (
-    counted,
     is_count,
     metres,
     parse_integer,
@@ -93,15 +92,6 @@ def test_a_length_has_three_digits_that_count_and_no_exponent():
     assert [metres(length) for length in lengths] == [*lengths.values()]
     assert (metres(0.25, "+"), metres(-0.25, "+")) == ("+0.250 m", "-0.250 m")
     assert (metres(1e-15), metres(float("nan"))) == ("0.000000 m", "nan m")
-
-
-def test_things_are_counted_with_their_plural():
-    numbers = (0, 1, 2, -1, 1200)
-    found = ["0 frames", "1 frame", "2 frames", "-1 frame", "1200 frames"]
-    assert [counted(number, "frame") for number in numbers] == found
-    assert counted(1, "frame", form="+d") == "+1 frame"
-    assert counted(1200, "point", form=",") == "1,200 points"
-    assert [counted(n, "match", "matches") for n in (1, 2)] == ["1 match", "2 matches"]
 
 
 UNITS = {

@@ -207,6 +207,7 @@ def test_a_limit_cuts_submaps_and_tiles_smaller_and_the_map_stays_the_same(monke
     np.testing.assert_allclose(whole_voxels.log_odds[order], cut_voxels.log_odds[other], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("blank_figures")
 def test_a_run_stopped_by_its_limit_goes_on_with_a_larger_one(tmp_path, monkeypatch):
     peaks = iter([400.0] * 6)

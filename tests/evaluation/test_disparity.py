@@ -15,7 +15,6 @@ from recon.evaluation.disparity import (
     measure_sparsification,
     ratio_within_sigma,
 )
-from recon.evaluation.middlebury.score import evaluate_middlebury
 
 N = float("nan")
 
@@ -66,18 +65,6 @@ def test_maps_without_values_or_truth_or_of_another_size_have_no_errors():
             measure(Disparity.from_values(estimate([1])), truth([N]))
     with pytest.raises(EvaluationError, match="both a disparity and a known truth"):
         ratio_within_sigma(Disparity.from_values(estimate([N, 1])), truth([1, N]))
-
-
-def test_plain_arrays_are_evaluated_like_values():
-    true = np.array([[8.0, np.inf, 0.0, 6.0], [4.0, 5.0, np.nan, 7.0]])
-    found = np.array([[8.5, 3.0, 3.0, np.inf], [9.0, 5.0, 1.0, np.nan]])
-    known = DisparityTruth.from_values(true.astype(np.float32))
-    expected = evaluate_disparity(found.astype(np.float32), known)
-    # Of five known pixels two have no value, and one is off by 5.
-    assert (expected.pixels, expected.invalid, expected.bad[2.0]) == (5, 40, 20)
-    for one in (found, found.tolist(), Disparity.from_values(found)):
-        assert evaluate_disparity(one, true) == expected
-        assert evaluate_middlebury(one, true.tolist()) == expected
 
 
 def test_each_kind_of_pixel_is_compared_alone():

@@ -144,15 +144,6 @@ def voxels(*occupied: np.ndarray, free: np.ndarray = WALL[:0]) -> OccupancyVoxel
     return OccupancyVoxels(keys, log_odds, EDGE_M)
 
 
-def test_the_true_occupancy_itself_is_perfect():
-    found = evaluate_occupancy(voxels(WALL, free=WALL - np.array([5, 0, 0])), TRUTH.grid, TRUTH)
-    for one in (found.voxels, found.voxels_exact):
-        assert (one.precision, one.recall, one.voxels, one.true_voxels) == (1.0, 1.0, 72, 72)
-    for each in (found.grid, found.grid_exact):
-        assert (each.iou_occupied, each.iou_free, each.unknown) == (1.0, 1.0, 0.0)
-        assert (each.cells, each.true_occupied) == (1200, 12)
-
-
 @pytest.mark.parametrize(("shift", "exact", "tolerant"), [(1, 0.0, 1.0), (2, 0.0, 0.0)])
 def test_the_tolerance_is_one_cell(shift, exact, tolerant):
     moved = OccupancyGrid(np.roll(CELLS, shift, axis=1), EDGE_M, (0.0, -2.0))

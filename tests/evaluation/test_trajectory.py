@@ -1,7 +1,6 @@
 """Errors of paths: counted by hand, as evo counts them (GPL-3, in development only)."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.commands.evaluate import run_evaluate_trajectory
 from recon.core.errors import EvaluationError
 from recon.core.geometry.alignment import fit_points, fit_upright
 from recon.core.geometry.se3 import (
@@ -32,7 +30,7 @@ from recon.evaluation.trajectory import (
     interpolation_warnings,
     segments_of,
 )
-from recon.io.trajectory import write_kitti_poses, write_tum
+from recon.io.trajectory import write_tum
 
 
 def trajectory(poses: np.ndarray) -> Trajectory:
@@ -312,41 +310,6 @@ def drive(frames: int, seed: int) -> tuple[Trajectory, Trajectory]:
         for k, motion in enumerate((moved, make_transform(exp_so3(turn), step))):
             paths[k] = np.concatenate([paths[k], paths[k][-1:] @ motion])
     return trajectory(paths[0]), trajectory(paths[1])
-
-
-def test_two_files_with_times_are_compared_by_them_as_the_command_does(tmp_path):
-    estimate, truth = drive(80, seed=4)
-    files = [tmp_path / name for name in ("estimate.txt", "truth.txt")]
-    # Every other frame was found, a millisecond late; the true path begins earlier and ends later.
-    found = estimate.select(np.arange(10, 70, 2))
-    late = replace(found, timestamps_s=found.timestamps_s + 0.001)
-    for path, one in zip(files, (late, truth), strict=True):
-        write_tum(path, one)
-    rules = TrajectoryRules(lengths_m=(10.0,))
-    metrics = evaluate_trajectory(*files, rules)
-    assert metrics.frames == 30
-    assert run_evaluate_trajectory(*files, rules).to_json()["ate_m"] == metrics.ate_m
-    expected = compare_paths(found, truth.select(np.arange(10, 70, 2)), rules).metrics
-    assert metrics.ate_m == pytest.approx(expected.ate_m, abs=1e-9)
-    with pytest.raises(EvaluationError, match="match in time"):
-        evaluate_trajectory(*files, rules, tolerance_s=1e-4)
-    # As many poses, but not of the same moments.
-    write_tum(files[1], truth.select(np.arange(11, 41)))
-    with pytest.raises(EvaluationError):
-        evaluate_trajectory(*files, rules, tolerance_s=1e-4)
-
-
-def test_paths_without_times_are_compared_in_order(tmp_path):
-    estimate, truth = drive(40, seed=5)
-    tum, kitti = tmp_path / "tum.txt", tmp_path / "kitti.txt"
-    write_tum(tum, estimate)
-    write_kitti_poses(kitti, truth)
-    expected = evaluate_trajectory(estimate, truth).ate_m
-    for pair in ((tum, kitti), (tum, truth), (estimate, kitti)):
-        assert evaluate_trajectory(*pair).ate_m == pytest.approx(expected, abs=1e-9)
-    for pair in ((tum, truth.select(np.arange(20))), (estimate, truth.select(np.arange(20)))):
-        with pytest.raises(EvaluationError, match="differ in length"):
-            evaluate_trajectory(*pair)
 
 
 @pytest.fixture

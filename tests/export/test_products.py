@@ -1,7 +1,6 @@
 """The products of a map, made tile by tile, are those of the whole map."""
 
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 
 from recon.commands.config import load_config
-from recon.core.errors import MappingError, OutputError, SettingsError
+from recon.core.errors import MappingError, SettingsError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform, transform_cloud
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, PointCloud
 from recon.core.values.arrays import Float64
@@ -18,7 +17,7 @@ from recon.export.costmap import make_costmap
 from recon.export.make import Products, make
 from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext
-from recon.io.models.ply import read_ply, write_ply_tiles
+from recon.io.models.ply import read_ply
 from recon.io.models.rasters import read_grid
 from recon.map.drive import mapper
 from recon.map.drive.sequence import MappedSequence, map_sequence
@@ -117,7 +116,7 @@ def test_a_vehicle_as_wide_as_the_margin_frees_what_it_passed(mapped, folder, wi
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)[:, :2]
     beside_m = path_m[5:15] + np.array([0.0, 2.5])
     aside = np.floor((beside_m - grid.origin_m) / 0.2).astype(int)
-    assert (grid.cells[aside[:, 1], aside[:, 0]] == FREE).mean() > 0.5
+    assert (grid.cells[aside[:, 1], aside[:, 0]] == FREE).all()
 
 
 @pytest.mark.parametrize(
@@ -201,24 +200,6 @@ def test_a_sample_is_small_and_even_and_all_of_a_small_cloud():
     assert np.abs(octants / len(kept) - 1 / 8).max() < 3 * np.sqrt(7 / 64 / len(kept))
 
 
-def test_tiles_in_one_file_are_read_as_one_cloud_and_an_error_leaves_none(tmp_path):
-    tiles = [_random_cloud(seed, 7 + 100 * seed) for seed in range(4)]
-    assert write_ply_tiles(tmp_path / "a.ply", iter(tiles), frame="map") == 628
-    back = read_ply(tmp_path / "a.ply")
-    np.testing.assert_array_equal(back.xyz, np.concatenate([tile.xyz for tile in tiles]))
-    assert back.frame == "map"
-    assert write_ply_tiles(tmp_path / "a.ply", iter([]), frame="map") == 0
-    assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
-
-    def failing() -> Iterator[PointCloud]:
-        yield tiles[0]
-        raise OutputError("disk full")
-
-    with pytest.raises(OutputError):
-        write_ply_tiles(tmp_path / "b.ply", failing(), frame="map")
-    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
-
-
 def test_a_costmap_of_tiles_lies_on_the_grid_and_has_the_robot_in_it(mapped, folder):
     context = ExportContext(mapped.map, mapped.placed, load_config().mesh)
     made = make(context, folder.content, ("costmap", "grid"))
@@ -235,13 +216,6 @@ def test_a_costmap_of_tiles_lies_on_the_grid_and_has_the_robot_in_it(mapped, fol
     ]
     assert min(figures) > 0
     assert folder.path("map/costmap.png").exists()
-
-
-def test_smaller_tiles_make_the_same_costmap(mapped):
-    whole = load_config(None, [*SETTINGS, "submaps.tile_m=200"])
-    ours, _ = make_costmap(mapped.map, mapped.placed)
-    theirs, _ = make_costmap(mapped.map, place_map(mapped.map, whole))
-    assert (ours.cells != theirs.cells).mean() < 0.001
 
 
 def test_a_costmap_without_rays_or_for_a_robot_flatter_than_ground_is_refused(mapped):

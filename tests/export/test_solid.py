@@ -127,13 +127,6 @@ def test_a_surface_stays_open_unless_a_thickness_is_given():
     assert not trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
 
 
-@pytest.mark.parametrize("thick", [0, -0.1, float("nan"), float("inf"), 1e9, "thick"])
-def test_a_thickness_that_is_none_is_refused(thick):
-    with pytest.raises(SettingsError, match="pair_solid_m") as caught:
-        MeshSettings.parse({"pair_solid_m": thick})
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize("other", [{"pair_surface": "poisson"}, {"target_faces": 1000}])
 def test_what_cannot_be_closed_is_said_before_anything_is_made(other):
     with pytest.raises(SettingsError, match="pair_solid_m"):

@@ -45,6 +45,11 @@ def boundary_edges(mesh: TriangleMesh, most: int | None = None) -> int:
 WHOLE = MeshSettings(depth=5, trim_density_quantile=0)
 
 
+def area_m2(mesh: TriangleMesh) -> float:
+    a, b, c = mesh.vertices[mesh.faces].astype(np.float64).transpose(1, 0, 2)
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
 def test_the_mesh_of_a_sphere_lies_on_it_is_closed_faces_out_and_has_its_colours():
     mesh = reconstruct_mesh(sphere(), WHOLE)
     # Cells of 2.2 m / 2^5 = 69 mm; the surface is placed far better than a cell.
@@ -129,7 +134,7 @@ def test_points_of_one_plane_and_those_that_are_not_finite_give_their_surface():
     xyz = np.random.default_rng(0).uniform(0, 1, (3000, 3)).astype(np.float32)
     xyz[:, 2] = 2
     mesh = reconstruct_mesh(PointCloud(xyz), MeshSettings())
-    assert len(mesh.faces) > 1000
+    assert area_m2(mesh) == pytest.approx(1.0, rel=0.2)  # and up to four spacings around
     # A tenth of the spacing of the points, which is 1 / sqrt(3000).
     assert np.abs(mesh.vertices[:, 2] - 2).max() < 0.002
     cloud = sphere()
@@ -206,7 +211,10 @@ def test_the_view_lies_on_its_surfaces_without_sheets_and_faces_the_camera(mesh)
 def test_a_scene_ten_times_as_large_has_the_same_triangles_one_behind_none():
     cloud, larger = hall(), replace(CAMERA, baseline_m=2.0)
     scaled = mesh_grid(replace(cloud, xyz=10 * cloud.xyz), larger, SETTINGS)
-    assert abs(len(scaled.faces) - len(mesh_grid(cloud, CAMERA, SETTINGS).faces)) < 20
+    once = mesh_grid(cloud, CAMERA, SETTINGS)
+    np.testing.assert_array_equal(scaled.faces, once.faces)
+    # float32 of 100 m.
+    np.testing.assert_allclose(scaled.vertices, 10 * once.vertices, rtol=0, atol=1e-4)
     with pytest.raises(MeshingError, match="too few points"):
         mesh_grid(PointCloud(-cloud.xyz), CAMERA, SETTINGS)
     with pytest.raises(MeshingError, match="hardly any pixels with a depth are neighbours"):

@@ -271,7 +271,7 @@ def test_a_pair_gives_its_cloud_and_mesh_and_no_grid(tmp_path):
     summary = run_export(run, config, formats=("ply", "glb"), out=tmp_path / "out").to_json()
     assert_equal(tmp_path / "out", run, "clouds/cloud.ply")
     assert len(read_mesh(tmp_path / "out/mesh/mesh.glb").faces) == summary["faces"]
-    assert summary["mesh_coverage"] > 0.5
+    assert summary["mesh_coverage"] == 1.0
     with pytest.raises(SettingsError, match=r"a pair has no such product .*grid.*cloud, mesh"):
         run_export(run, load_config(), products=["grid"], out=tmp_path / "out")
 

@@ -23,8 +23,8 @@ from recon.commands.localize import run_localize
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.progress import Counted, Silent, showing
-from recon.core.values import UNKNOWN
 from recon.io.models.ply import read_ply
+from recon.io.models.rasters import read_grid
 from recon.run.directory import STARTED, state_folder
 from recon.view.follow import add_located, finish, follow_located, grow
 from recon.view.scene import colours
@@ -47,7 +47,8 @@ def test_a_finished_run_shows_all_points_of_its_cloud_its_grid_path_and_drift(sm
     (path,), ((grid, height_m),) = scene.paths, scene.grids
     assert len(path.cloud) == 12
     assert -3 < height_m < -1
-    assert (grid.cells != UNKNOWN).any()
+    made = read_grid(small_demo / "map/grid.yaml")
+    np.testing.assert_array_equal(grid.cells, made.cells)
     assert any(line.startswith("expected_drift_percent") for line in scene.lines)
     assert f"points {len(whole):,}" in scene.lines
 
@@ -115,7 +116,11 @@ def test_a_located_drive_is_shown_in_its_map(small_demo, tmp_path):
     near = np.linalg.norm(found.cloud.xyz[:, None] - own.cloud.xyz, axis=2).min(axis=1)
     assert near.max() < 0.2
     assert {tuple(rgb) for rgb in found.cloud.rgb.tolist()} <= {(255, 167, 38), (67, 200, 90)}
-    assert found.values("age").max() > 0
+    # Seconds since the first frame.
+    ages_s = found.values("age")
+    assert (np.diff(ages_s) > 0).all()
+    np.testing.assert_allclose(ages_s, np.rint(10 * ages_s) / 10, atol=1e-6)
+    assert 0 <= ages_s[0] < ages_s[-1] < 1.2
 
 
 class Watching(Silent):

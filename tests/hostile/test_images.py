@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import struct
-import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ import pytest
 
 from recon.core.values import PointCloud, StereoPair
 from recon.core.values.arrays import Float32
-from recon.io.images.disparity import read_pfm, write_pfm
+from recon.io.images.disparity import read_pfm
 from recon.io.images.image import read_image, stated_size, write_image
 from recon.io.models.ply import read_ply, write_ply
 from recon.sources.registry import open_source
@@ -173,36 +172,26 @@ def test_a_hostile_header_of_an_image_is_refused(content, tmp_path):
     assert "i.png" in (refusal(lambda: read_image(tmp_path / "i.png")) or "i.png")
 
 
-def test_every_truncation_of_an_image_or_disparity_is_refused(tmp_path):
-    image = np.random.default_rng(3).integers(0, 255, (7, 9), np.uint8)
-    for suffix in (".png", ".jpg", ".pgm", ".tiff", ".bmp"):
-        content = cv2.imencode(suffix, image)[1].tobytes()
-        for length in range(1, len(content) - 16, 7):
-            (tmp_path / "i.png").write_bytes(content[:length])
-            with warnings.catch_warnings(record=True) as said:
-                assert refusal(lambda: read_image(tmp_path / "i.png")) is not None, (suffix, length)
-            assert said == []
-    write_pfm(tmp_path / "d.pfm", np.ones((4, 5), np.float32))
-    content = (tmp_path / "d.pfm").read_bytes()
-    for length in range(len(content)):
-        (tmp_path / "d.pfm").write_bytes(content[:length])
-        assert refusal(lambda: read_pfm(tmp_path / "d.pfm")) is not None, length
+MATCHED: Final = [
+    f"{command} --matcher {matcher}"
+    for command in ("disparity", "pair")
+    for matcher in ("sad", "sgm", "opencv-bm", "opencv-sgbm")
+]
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 48), (48, 1), (2, 2), (3, 1000), (1000, 3)])
-@pytest.mark.parametrize("matcher", ["sad", "sgm", "opencv-bm", "opencv-sgbm"])
-@pytest.mark.parametrize("command", ["disparity", "pair", "rectify"])
-def test_a_tiny_image_is_matched_or_refused(command, matcher, size, here):
+@pytest.mark.parametrize("command", ["rectify", *MATCHED])
+def test_a_tiny_image_is_matched_or_refused(command, size, here):
     image = np.random.default_rng(1).integers(0, 255, size, np.uint8)
     for name in ("left.png", "right.png"):
         write_image(here / name, image)
     rig = OURS.replace("width_px: 48", f"width_px: {size[1]}")
     Path("rig.yaml").write_text(rig.replace("height_px: 32", f"height_px: {size[0]}"))
-    more = () if command == "rectify" else ("--matcher", matcher)
-    calib = () if command == "disparity" else ("--calib", "rig.yaml")
-    ended = run(command, "left.png", "right.png", *calib, *more, "--quiet", "--out", "out")
-    assert ended.code in {0, 1}
-    if ended.code == 1:
+    calib = () if command.startswith("disparity") else ("--calib", "rig.yaml")
+    ended = run(*command.split(), "left.png", "right.png", *calib, "--quiet", "--out", "out")
+    if ended.code == 0:
+        assert Path("out/run.json").is_file()
+    else:
         assert_refused(ended)
         assert not Path("out").exists()
 
@@ -247,14 +236,6 @@ def test_a_drive_of_that_name_is_read(name, good_drive, here):
     source = open_source(Path(shutil.copytree(good_drive, here / NAMES[name])))
     assert len(list(source)) == 3
     assert NAMES[name] in source.name
-
-
-@pytest.mark.parametrize("digits", ["²", "٣", "①", "५"])
-def test_images_with_digits_of_any_script_are_paired(digits, drive):
-    for number, path in enumerate(sorted(drive.glob("image_*/*.png"))):
-        path.rename(path.with_name(f"{digits * (number % 3 + 1)}.png"))
-    line = refusal(lambda: list(open_source(drive)))
-    assert line is None or "drive" in line
 
 
 NOISE: Final = np.random.default_rng(3).integers(0, 255, (32, 64), np.uint8)

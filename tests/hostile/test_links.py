@@ -244,13 +244,6 @@ def test_a_mended_calibration_replaces_no_input_and_no_device(drive, target):
     assert state(drive.parent) == before
 
 
-@pytest.mark.parametrize("name", ["drive/calib.txt", "", ".", "drive/times.txt"])
-def test_a_mended_calibration_is_a_file_of_its_own(drive, name):
-    before = state(drive)
-    assert_refused(run("audit", "drive", "--repair", name, "--quiet"), name)
-    assert state(drive) == before
-
-
 def test_a_calibration_replaces_no_picture_of_the_board(pair):
     Path("rig_left.yaml").hardlink_to("left.png")
     before = state(pair[0].parent)

@@ -15,18 +15,12 @@ import numpy as np
 import pytest
 
 import recon
-from recon.commands.config import load_config
-from recon.commands.demo import demo_source
-from recon.commands.map import run_map
-from recon.commands.map_options import MapOptions
-from recon.core.errors import FormatError, MemoryLimitError
+from recon.core.errors import FormatError
 from recon.core.values import PointCloud
-from recon.io.files import reading
 from recon.io.models.ply import write_ply
 from recon.map.store.records import Store
 from recon.run.run import Run
 from recon.stereo.match import registry
-from tests.hostile.conftest import DRIVE
 from tests.hostile.refusals import Ended, assert_refused, run
 from tests.scenery.patience import LONG_S
 
@@ -133,16 +127,6 @@ def test_a_full_disk_at_the_beginning_leaves_nothing(here):
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert failed.value.errno
     assert_refused(ended, "File too large")
-    assert list(here.iterdir()) == []
-
-
-def test_a_demo_that_cannot_be_resumed_does_not_advise_it(here):
-    config = load_config(None, [f"street.{key}={value}" for key, value in DRIVE.items()])
-    config = config.model_copy(update={"memory": config.memory.model_copy(update={"limit_mb": 1})})
-    options = MapOptions(command="demo", out=here / "out", audit=False, mesh=False)
-    with pytest.raises(MemoryLimitError) as told:
-        run_map(demo_source(config), config, options)
-    assert "--resume" not in str(told.value)
     assert list(here.iterdir()) == []
 
 
@@ -267,11 +251,6 @@ def test_a_command_names_the_package_that_it_lacks(command, here):
     write_ply(here / "cloud.ply", PointCloud(np.random.default_rng(0).random((200, 3), np.float32)))
     done = subprocess.run([sys.executable, "-c", lacking], capture_output=True, check=False)
     assert_refused(Ended(done.returncode, done.stdout.decode(), done.stderr.decode()), package)
-
-
-def test_a_missing_package_is_no_fault_of_the_file_that_is_read(here):
-    with pytest.raises(ModuleNotFoundError), reading(here / "file"):
-        raise ModuleNotFoundError("No module named 'cv2'", name="cv2")
 
 
 def test_no_module_can_run_what_it_reads():

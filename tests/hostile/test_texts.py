@@ -117,21 +117,6 @@ def test_every_command_names_the_option(command, pair):
     assert sorted(path.name for path in Path().iterdir()) == ["left.png", "right.png"]
 
 
-@pytest.mark.parametrize("threads", ["1000000", "99999999999999999999"])
-def test_more_threads_than_cores_are_harmless(threads, pair):
-    ended = run("disparity", *pair, "--threads", threads, "--quiet", "--out", "out")
-    assert ended.code in {0, 1}
-    assert len(ended.lines) <= 1
-
-
-@pytest.mark.parametrize("limit", ["1e3", "-1G", "²G", "1" * 5000, "0.0", "G", "nan", "inf"])
-def test_a_hostile_memory_limit_is_refused(limit, here):
-    ended = run("map", here, "--memory-limit", limit)
-    assert ended.code in {1, 2}
-    assert len(ended.lines[-1]) < 6000
-    assert list(here.iterdir()) == []
-
-
 @pytest.mark.parametrize("number", ["1_0", "\u0661\u0662"])
 @pytest.mark.parametrize("option", [
     "pair left.png right.png --threads",

@@ -30,13 +30,6 @@ def test_text_appears_whole_under_its_name_and_nothing_else_stays(tmp_path):
     assert names(tmp_path / "run") == ["a.txt"]
 
 
-def test_the_temporary_shares_folder_and_suffixes_with_the_target(tmp_path):
-    with atomic_path(tmp_path / "map.tar.gz") as temporary:
-        assert (temporary.parent, temporary.suffixes) == (tmp_path, [".tar", ".gz"])
-        assert not temporary.exists()
-        temporary.write_bytes(b"x")
-
-
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, FormatError])
 def test_a_failing_block_keeps_the_old_file_and_leaves_no_temporary(tmp_path, error):
     target = tmp_path / "a.txt"

@@ -67,20 +67,6 @@ def test_a_header_that_names_its_columns_is_believed(tmp_path, head, mark, unit,
     assert holds_times(path)
 
 
-def test_a_header_in_the_order_of_tum_is_read_as_that_whatever_comes_first(tmp_path):
-    table = rows(drive())[:, [5, 6, 7, 4, 0, 1, 2, 3]]
-    head = (
-        "orientation.x,orientation.y,orientation.z,orientation.w,t,position.x,position.y,position.z"
-    )
-    read = read_trajectory(write_columns(tmp_path / "poses.csv", table, head))
-    np.testing.assert_allclose(read.T_world_camera, drive().T_world_camera, atol=1e-8)
-
-
-def write_columns(path, table, head):
-    np.savetxt(path, table, "%.9f", ",", header=head, comments="")
-    return path
-
-
 def test_the_17_columns_of_euroc_need_no_header(tmp_path):
     zeros = ["0.0"] * 9
     path = write(tmp_path / "data.csv", rows(drive()), "", ",", 1e-9, zeros)

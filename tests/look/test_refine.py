@@ -250,22 +250,3 @@ class Plain(StereoSource):
 
 
 GIVEN = RectifiedCamera(200.0, 99.5, 49.5, 99.5, 0.5, 200, 100)
-KINDS = {
-    "property": Plain,
-    "attribute": lambda: Film([], GIVEN, np.zeros((0, 4, 4))),
-    "frozen": lambda: faults.Spoiled(GIVEN, 0, lambda index: None),
-}
-
-
-@pytest.mark.parametrize("kind", KINDS.values(), ids=[*KINDS])
-def test_a_source_of_any_kind_takes_another_calibration(kind):
-    source, other = kind(), replace(GIVEN, baseline_m=0.25)
-    assert source.calibration is GIVEN
-    changed = source.with_calibration(other)
-    assert changed.calibration is other
-    assert isinstance(changed, type(source))
-    assert changed.name == source.name
-    assert changed.with_calibration(GIVEN).calibration is GIVEN
-    assert changed.calibration is other
-    assert source.calibration is GIVEN
-    assert SourcePart(changed, 0, 0).calibration is other

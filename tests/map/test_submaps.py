@@ -5,7 +5,7 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.core.errors import MappingError
-from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform, transform_cloud
+from recon.core.geometry.se3 import apply, exp_so3, make_transform, transform_cloud
 from recon.core.kernels.voxels import are_among, pack_keys
 from recon.core.values import OccupancyVoxels, PointCloud, RectifiedCamera, join_voxels
 from recon.core.values.arrays import Float64, tree_of
@@ -168,14 +168,6 @@ def test_tiles_together_are_the_filtered_whole(store):
     assert_same_voxels(voxels_of(tiles), occupancy.voxels(0.2))
 
 
-def test_a_tile_is_made_once(store, monkeypatch):
-    tiles = _tiles(store)
-    first = [(tile.cloud.xyz, tile.voxels.keys) for tile in tiles]
-    for name in ("join_fused", "join_occupancy"):
-        monkeypatch.delattr(f"recon.map.tiles.{name}")
-    np.testing.assert_equal([(tile.cloud.xyz, tile.voxels.keys) for tile in tiles], first)
-
-
 def test_what_is_observed_later_changes_a_tile_as_in_one_long_drive(store):
     tiles = _tiles(store)
     seen = voxels_of(tiles)
@@ -226,16 +218,8 @@ def test_points_and_voxels_that_are_put_in_come_out(store):
     # A tile without points takes nothing from the others.
     far = OccupancyVoxels(np.int32([[40, 3, 0]]), np.ones(1, np.float32), filled.resolution_m)
     put_voxels(filled, far)
-    assert filled.cloud_in(EVERYWHERE).sigma_m is not None
-
-
-def test_corrections_move_the_submaps_apart(store):
-    T = np.tile(np.eye(4), (len(store), 1, 1))
-    turned = make_transform(exp_so3(np.array([0.0, 0.01, 0.0])), np.array([30.0, 0.0, 0.0]))
-    T[len(store) // 2 :] = turned
-    to_right_m = -cloud_of(_tiles(store, T)).xyz[:, 1]
-    assert ((to_right_m < 4) | (to_right_m > 32)).all()
-    assert 0.2 < np.mean(to_right_m < 4) < 0.8
+    sigma_m = filled.cloud_in(EVERYWHERE).sigma_m
+    np.testing.assert_array_equal(np.sort(sigma_m), np.sort(cloud.sigma_m))
 
 
 def test_a_path_that_leaves_a_rectangle_and_comes_back_is_in_pieces():
@@ -262,12 +246,6 @@ def _part(*clouds: PointCloud) -> FusedPart:
 
 def _fused(*clouds: PointCloud, least: int = 1) -> PointCloud:
     return _part(*clouds).cloud(0.1, least)
-
-
-def test_voxels_seen_too_rarely_are_not_exported():
-    clouds = [_cloud([HERE, ELSEWHERE]), _cloud(HERE), _cloud(HERE)]
-    assert _fused(*clouds, least=3).xyz.tolist() == pytest.approx(np.float32([HERE]))
-    assert len(_fused(*clouds)) == 2
 
 
 def test_precise_voxels_need_one_frame_less(monkeypatch):
@@ -343,21 +321,3 @@ def test_fusion_range_is_where_the_nominal_error_reaches_its_limit():
     range_m = fusion_range_m(camera, FusionSettings(max_depth_error_m=0.2))
     assert depth_sigma(np.array([range_m]), 0.3, camera)[0] == pytest.approx(0.2, rel=1e-6)
     assert fusion_range_m(camera, FusionSettings(max_depth_error_m=None)) == np.inf
-
-
-def _slope(seed: int) -> PointCloud:
-    """What one frame sees of a slope: fewer points in a voxel far away than near."""
-    rng = np.random.default_rng(seed)
-    across, far = rng.uniform(-1.5, 1.5, 6000), 8 * rng.uniform(0, 1, 6000) ** 2
-    up = 0.04 + 0.1 * far + rng.normal(0, 0.02, 6000)
-    return _cloud(np.stack([across, up, far], axis=1), sigma_m=np.full(6000, 0.1, np.float32))
-
-
-@pytest.mark.xfail(strict=True, reason="a voxel is moved as one point, so points are missing")
-def test_frames_fused_in_one_session_and_in_two_give_as_many_points():
-    frames = [_slope(seed) for seed in range(10)]
-    T = make_transform(exp_so3(np.array([0.02, 0.05, -0.01])), np.array([0.33, 0.17, 0.46]))
-    there = [transform_cloud(cloud, invert(T), frame="world") for cloud in frames[1::2]]
-    odd = _part(*there).moved(T, 0.1)
-    two = join_fused([_part(*frames[::2]), odd]).cloud(0.1, 3)
-    assert len(two) == pytest.approx(len(_fused(*frames, least=3)), rel=0.02)

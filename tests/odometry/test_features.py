@@ -1,6 +1,5 @@
 """Features of an image, and where they are in the next one."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -43,17 +42,6 @@ def test_corners_of_a_square_are_found_and_of_a_crowd_the_first_stay():
     expected = [False, False, False, False, False, True, True]
     assert features.in_crowd(gathered, (100, 300)).tolist() == expected
     assert features.in_crowd(np.zeros((0, 2)), (100, 300)).shape == (0,)
-
-
-def test_fewer_corners_are_corners_too(see):
-    grey = see(np.eye(4)).pair.left
-    many, few = features.find_corners(grey, NONE), features.find_fewer_corners(grey, NONE)
-    assert 0.15 < len(few) / len(many) < 0.6
-    score = cv2.cornerMinEigenVal(grey, 5)
-    column, row = few.astype(int).T
-    assert np.median(score[row, column]) > np.median(score)
-    more = features.find_fewer_corners(grey, few)
-    assert len(more) < 0.2 * len(few)
 
 
 def test_what_leaves_the_image_is_not_followed(see):

@@ -5,10 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import recon
-from recon.cli import app
 from recon.core.errors import RegistrationError, SettingsError
 from recon.odometry.registry import ODOMETRIES, ForeignOdometry, make_odometry
 from tests.stereo.match.test_foreign_matchers import install_plugin
@@ -111,20 +109,6 @@ def test_an_error_inside_is_reported_and_kept_as_the_cause(blind):
         odometry.restore({"odometry": {"own": {}, "begun": True}, "last": None})
 
 
-@pytest.mark.parametrize("method", ["register", "state", "restore"])
-def test_an_odometry_that_exits_ends_nothing(method, blind):
-    class Exiting(Ahead):
-        pass
-
-    def leave(*_: object) -> None:
-        raise SystemExit(0)
-
-    setattr(Exiting, method, leave)
-    odometry, given = ForeignOdometry(Exiting(), "mine"), {"register": [blind()], "state": []}
-    with pytest.raises(RegistrationError, match=r"'mine'.*fails.*SystemExit: 0"):
-        getattr(odometry, method)(*given.get(method, [{"own": {}, "begun": True}]))
-
-
 @pytest.mark.parametrize(
     "state", [None, [1], {1: 2}, {"a": {3}}, {"a": np.array(["x"])}, {"a": [{"b": object()}]}]
 )
@@ -204,23 +188,6 @@ def test_a_registered_odometry_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
         make_odometry("ahead")
 
 
-@pytest.mark.usefixtures("plugin")
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("missing", "does not load.*AttributeError.*Nowhere"),
-        ("gone", "does not load.*ModuleNotFoundError.*not_there"),
-        ("nothing", "makes no odometry.*int.*register"),
-        ("fails", "does not load.*RuntimeError: no model here"),
-    ],
-)
-def test_a_broken_plugin_is_named_in_one_line(name, words):
-    with pytest.raises(SettingsError, match=words) as raised:
-        make_odometry(name)
-    assert f"odometry {name!r}" in str(raised.value)
-    assert "of package go-ahead" in str(raised.value)
-
-
 @pytest.mark.usefixtures("plugin", "blank_figures")
 def test_a_drive_is_mapped_with_a_plugin_and_results_name_it(tmp_path):
     source = recon.SyntheticSource(recon.load_config(overrides=[
@@ -235,13 +202,3 @@ def test_a_drive_is_mapped_with_a_plugin_and_results_name_it(tmp_path):
     with pytest.raises(RegistrationError, match=r"odometry 'worse', frame 0: .*no rigid pose.*nan"):
         recon.run_map(source, recon.load_config(overrides=["odometry.method=worse"]), bad)
     assert not (tmp_path / "bad").exists()
-
-
-def test_the_command_line_lists_the_choices(tmp_path):
-    from tests.scenery.kitti import street_drive
-
-    drive = street_drive(tmp_path / "d", 2, 64)
-    done = CliRunner().invoke(app, ["map", str(drive), "--odometry", "orb", "--quiet"])
-    assert done.exit_code == 1
-    assert done.stderr.startswith("error: unknown odometry (got 'orb', expected one of: kiss, sfm,")
-    assert done.stderr.count("\n") == 1

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.core.errors import RegistrationError, SettingsError
+from recon.core.errors import RegistrationError
 from recon.core.geometry.se3 import as_transform, invert
 from recon.core.values import RectifiedPair, Trajectory, TrajectoryMetrics
 from recon.evaluation.trajectory import evaluate_trajectory
@@ -21,7 +21,6 @@ from recon.odometry.health import (
 )
 from recon.odometry.protocol import OdometryFrame, OdometryHealth
 from recon.odometry.registry import ODOMETRIES, KnownPoses, make_odometry
-from recon.odometry.settings import OdometrySettings
 from recon.sources.registry import open_source
 from recon.stereo.match.registry import make_matcher
 
@@ -39,12 +38,6 @@ def test_a_saved_odometry_goes_on_to_the_bit(name, street, tmp_path):
         ours, theirs = saved.register(frame), unbroken.register(frame)
         np.testing.assert_array_equal(ours.T_world_camera, theirs.T_world_camera)
         assert repr(ours.health) == repr(theirs.health)
-
-
-def test_the_settings_offer_what_there_is():
-    with pytest.raises(SettingsError, match=r"unknown odometry.*one of: kiss, sfm, visual"):
-        make_odometry("lidar")
-    assert OdometrySettings().method == "visual"
 
 
 def test_known_poses_begin_at_the_identity_and_are_picked_by_the_number_of_the_frame(

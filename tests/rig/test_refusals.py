@@ -78,6 +78,7 @@ def late(street, tmp_path):
     return drives.write_kitti(grey, faults.rectified(street), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_late_drive_is_paired_as_it_belongs_together_and_says_so_first(late, tmp_path):
     found = "right camera is 2 frames late: its images are paired"
     out = tmp_path / "out"

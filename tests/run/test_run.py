@@ -16,7 +16,7 @@ from recon.core.progress import Silent, showing
 from recon.core.settings import Settings
 from recon.core.summary import RunSummary, to_json
 from recon.io.atomic import exchange
-from recon.io.files import fingerprint, refuse_links
+from recon.io.files import fingerprint
 from recon.run import directory
 from recon.run.directory import RunDirectory, state_folder
 from recon.run.run import Run, WholeRun
@@ -248,14 +248,3 @@ def test_a_folder_of_other_files_and_a_file_are_refused(tmp_path, inside, said):
     assert str(tmp_path / inside) in str(told.value)
     assert "\n" not in str(told.value)
     assert files_in(tmp_path) == {"thesis"}
-
-
-def test_links_below_a_folder_are_refused_and_the_folder_may_be_one(tmp_path):
-    (tmp_path / "run" / "map").mkdir(parents=True)
-    (tmp_path / "latest").symlink_to("run")
-    refuse_links(tmp_path / "latest" / "map")
-    with pytest.raises(FormatError, match="latest"):
-        refuse_links(tmp_path / "latest" / "map", below=tmp_path)
-    (tmp_path / "run" / "map" / "cloud.ply").symlink_to("/etc/passwd")
-    with pytest.raises(FormatError, match=r"cloud\.ply"):
-        refuse_links(tmp_path / "run")

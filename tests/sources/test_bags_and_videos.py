@@ -10,18 +10,18 @@ import pytest
 from recon.core.errors import ReconError, SourceError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera, StereoCalibration
-from recon.io.cameras.ros import are_rectified
-from recon.sources.bag import rig_of_messages
+from recon.sources.bag import read_measured, rig_of_messages
 from recon.sources.registry import open_source
 from recon.sources.rosbags import BagCameraInfo
 from recon.sources.settings import SourceSettings
 from recon.sources.source import StereoSource
 from recon.sources.video import VideoFile, view_size
 from tests.sources import drives
+from tests.sources.bags import TOPICS, Recording, bag, recorder
 from tests.sources.drives import CAMERA
 
 pytest.importorskip("rosbags", reason="extra ros")
-from tests.sources.bags import TOPICS, Recording, bag, recorder
+
 
 KINDS = ["ros1", "ros2", "mcap"]
 START_NS = drives.EPOCH_S * 10**9
@@ -179,13 +179,6 @@ def test_the_baseline_is_between_the_cameras_wherever_both_measure_from(rectifie
         rig_of_messages(*infos[::-1], Path("drive.bag"), rectified)
 
 
-def test_rectified_messages_of_two_focal_lengths_are_refused():
-    left, right = (np.array([[f, 0, 31.5, x], [0, f, 15.5, 0], [0, 0, 1, 0]])
-                   for f, x in ((60.0, 0.0), (61.0, -30.0)))  # fmt: skip
-    with pytest.raises(ReconError, match=r"drive\.bag: P of the left and P of the right have diff"):
-        rig_of_messages(info_of(left), info_of(right), Path("drive.bag"), rectified=True)
-
-
 VIEW = RectifiedCamera(72.0, 61.0, 17.3, 61.0, 0.54, 124, 37)
 RAW = {"K": [98.4, 0, 69.0, 0, 98.4, 23.3, 0, 0, 1], "D": [-0.37, 0.2, 0.002, 0.001, -0.07]}
 RAW_TOPICS = ("/kitti/left/image_raw", "/kitti/right/image_raw")
@@ -219,17 +212,6 @@ def test_images_of_the_lens_are_raw_though_their_projection_fits_as_well(tmp_pat
     source = recorded(tmp_path, size, np.zeros((51, 139), np.uint8), **RAW)
     assert isinstance(source.calibration, StereoCalibration)
     assert (len(list(source)), source.warnings()) == (1, [])
-
-
-def test_a_sensor_that_is_read_off_its_centre_stays_raw(tmp_path):
-    """The projection is off by as much, since it shows what the lens shows."""
-    K, P = ([f, 0, 61.0, *last, 0, f, 26.0, *last, 0, 0, 1, *last]
-            for f, last in ((98.4, []), (90.0, [0.0])))  # fmt: skip
-    right = [*P[:3], -49.0, *P[4:]]
-    assert not are_rectified(
-        (np.reshape(K, (3, 3)),) * 2, (np.reshape(P, (3, 4)), np.reshape(right, (3, 4))),
-        (124, 37), (124, 37),
-    )  # fmt: skip
 
 
 def test_images_of_half_the_size_of_their_calibration_are_still_refused(tmp_path):
@@ -324,7 +306,8 @@ def test_a_video_may_end_a_little_earlier(noise, tmp_path, shorter):
     drives.write_video(tmp_path / f"{shorter}.avi", views[:-1])
     source = open_source(tmp_path)
     assert source.left_out == 1
-    assert "1 right" in source.description or "1 left" in source.description
+    assert source.description.startswith("two videos, 10 Hz, paired frame by frame")
+    assert f"1 {'right' if shorter == 'left' else 'left'}" in source.description
     assert len(list(source)) == len(source) == 23
     drives.write_video(tmp_path / f"{shorter}.avi", views[:-2])
     fails(tmp_path, r"different numbers of frames \(got left 2[24], right 2[24]\)")
@@ -372,6 +355,67 @@ def test_views_may_stand_in_any_order_in_one_video(noise, tmp_path, layout, flip
     images = [[p.left, p.right][:: -1 if flip else 1] for p in noise]
     drives.write_calib(tmp_path, CAMERA)
     path = drives.write_video(tmp_path / "both.avi", [stack(both) for both in images])
-    read = list(open_source(path, settings=SourceSettings(side_by_side=layout)))  # type: ignore[arg-type]
+    source = open_source(path, settings=SourceSettings(side_by_side=layout))  # type: ignore[arg-type]
+    assert source.description.startswith(f"{layout} in one video, 10 Hz")
+    read = list(source)
     np.testing.assert_array_equal(read[3].left[:, :, 0], noise[3].left)
     np.testing.assert_array_equal(read[3].right[:, :, 0], noise[3].right)
+
+
+PLACES = np.column_stack([49.0 + 1e-5 * np.arange(8), np.full(8, 8.4), 115 + 0.1 * np.arange(8)])
+
+
+def write_fixes(
+    folder, kind="mcap", topics=("/gps/fix",), sigma_m=(0.02, 0.01, 0.03), places=PLACES, **how
+):
+    with recorder(folder, Recording(kind)) as bag:
+        bag.write("/imu", START_NS, bag.imu(START_NS, np.zeros(3), np.zeros(3), "imu"))
+        for number, place in enumerate(places):
+            time_ns = START_NS + 100_000_000 * number
+            for topic in topics:
+                bag.write(topic, time_ns + 5_000_000, bag.fix(time_ns, place, sigma_m, **how))
+    return Recording(kind).path(folder)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "ros2", "mcap"])
+def test_positions_have_the_times_of_their_headers_and_the_spread_of_their_covariance(
+    tmp_path, kind
+):
+    found = read_measured(write_fixes(tmp_path, kind))
+    np.testing.assert_allclose(found.times_s, START_NS / 1e9 + 0.1 * np.arange(8), atol=1e-6)
+    np.testing.assert_allclose(found.places, PLACES, rtol=1e-12)
+    np.testing.assert_allclose(found.sigma_m, np.tile([0.02, 0.01, 0.03], (8, 1)))
+    assert (found.degrees, found.heights) == (True, "the ellipsoid")
+
+
+def test_what_is_not_known_is_not_invented(tmp_path):
+    path = write_fixes(tmp_path, sigma_m=None)
+    assert np.isnan(read_measured(path).sigma_m).all()
+    endless = write_fixes(tmp_path / "endless", sigma_m=np.full(3, np.inf))
+    assert np.isnan(read_measured(endless).sigma_m).all()
+    with pytest.raises(ReconError, match="no position"):
+        read_measured(write_fixes(tmp_path / "none", status=-1))
+
+
+@pytest.mark.parametrize("height_m", [np.nan, np.inf, 1e300, -1e20])
+def test_a_message_without_a_height_on_earth_is_left_out(tmp_path, height_m):
+    places = PLACES.copy()
+    places[3, 2] = height_m
+    found = read_measured(write_fixes(tmp_path, places=places))
+    np.testing.assert_allclose(found.places, np.delete(PLACES, 3, axis=0), rtol=1e-12)
+
+
+def test_of_several_receivers_one_is_named(tmp_path):
+    path = write_fixes(tmp_path, topics=("/front/fix", "/rear/fix"))
+    with pytest.raises(ReconError, match=r"several receivers .*/front/fix \(8\).*:/front/fix"):
+        read_measured(path)
+    assert len(read_measured(Path(f"{path}:/rear/fix")).times_s) == 8
+    with pytest.raises(ReconError, match=r"no positions of a receiver .*/front/fix"):
+        read_measured(Path(f"{path}:/imu"))
+
+
+def test_a_recording_without_a_receiver_names_its_topics(tmp_path):
+    with pytest.raises(ReconError, match=r"no positions of a receiver .*no NavSatFix among /imu"):
+        read_measured(write_fixes(tmp_path, topics=()))
+    with pytest.raises(ReconError, match="does not exist"):
+        read_measured(tmp_path / "missing.bag")

@@ -480,16 +480,6 @@ def test_padded_counters_are_no_times(tmp_path, digits, step, count):
     assert "no times: assumed 10 Hz" in open_source(folder).description
 
 
-@pytest.mark.parametrize(("names", "expected"), [
-    (["1600000000", "1600000001"], [1600000000, 1600000001]),
-    (["1600000000123", "1600000000156"], [1600000000.123, 1600000000.156]),
-    # Nanoseconds since a simulation began.
-    (["0000000000000000000", "0000000000050000000"], [0.0, 0.05]),
-])  # fmt: skip
-def test_integer_times_stay_times(tmp_path, names, expected):
-    assert times(write_named(tmp_path, names)) == pytest.approx(expected, abs=1e-6)
-
-
 @pytest.mark.parametrize("name", ["{:010d}", "16000000{:02d}", "{}.5", "frame{}"])
 @pytest.mark.parametrize("place", [".", "left"])
 def test_a_times_file_wins_and_may_have_exposures(tmp_path, name, place):

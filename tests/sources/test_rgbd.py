@@ -237,9 +237,3 @@ def test_a_calibration_of_raw_cameras_is_refused(source, copied):
 def test_settings_that_do_not_fit_are_refused(drive, settings, error, what):
     with pytest.raises(error, match=what):
         open_source(drive, settings=WIDE.model_copy(update=settings))
-
-
-def test_missing_images_are_said(copied):
-    (copied / "rgb.txt").unlink()
-    with pytest.raises(FormatError, match=r"rgb\.txt"):
-        open_source(copied, settings=WIDE)

@@ -7,7 +7,6 @@ from threading import Event
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -17,12 +16,11 @@ from recon.core.values import RectifiedCamera, StereoPair
 from recon.map.localize.sequence import localize_sequence
 from recon.rig.audit import audit_source
 from recon.sources.live import LiveSource
-from recon.sources.source import SourcePart, StereoSource, mark_of
+from recon.sources.source import SourcePart, StereoSource
 from recon.sources.synthetic import SyntheticSource
 from recon.street.settings import StreetScene, StreetSettings
 from tests.scenery.film import RIG, Film, film
 from tests.scenery.patience import LONG_S
-from tests.sources.drives import write_calib
 
 
 class Own(recon.StereoSource):
@@ -51,29 +49,6 @@ def test_a_subclass_is_mapped_and_has_defaults_for_the_rest(own):
     assert (own.live, own.lead, own.hurried()) == (False, 0, False)
     assert (own.warnings(), own.figures().to_json()) == ([], {})
     assert [own.lines(count) for count in (2, 3, 4)] == [None, [0, 1, 2], [0, 1, 2]]
-
-
-@pytest.mark.parametrize("suffix", [".pgm", ".bmp", ".tif"])
-def test_a_drive_whose_uncompressed_pixels_differ_later_is_another_one(tmp_path, suffix):
-    rng, marks = np.random.default_rng(2), set()
-    images = rng.integers(0, 256, (4, 320, 640), dtype=np.uint8)
-    write_calib(tmp_path, RectifiedCamera(500.0, 319.5, 159.5, 319.5, 0.5, 640, 320))
-    for row in (None, 0, 150, 299):
-        for number, image in enumerate(images):
-            changed = image.copy()
-            if row is not None and number == 3:
-                changed[row : row + 21] ^= 1  # a 16th of the rows
-            side = tmp_path / ("left", "right")[number % 2]
-            side.mkdir(exist_ok=True)
-            # OpenCV compresses what it writes as TIFF.
-            name, how = str(side / f"{number // 2}{suffix}"), (cv2.IMWRITE_TIFF_COMPRESSION, 1)
-            assert cv2.imwrite(name, changed, how if suffix == ".tif" else ())
-        source = recon.open_source(tmp_path)
-        mark = mark_of(source)
-        assert mark == mark_of(recon.open_source(tmp_path))
-        marks.add((mark["sha256"], mark["bytes"], mark["frames"]))
-    assert len(marks) == 4
-    assert len({size for _, size, _ in marks}) == 1
 
 
 def test_a_part_has_the_pairs_of_its_range(own):
@@ -105,23 +80,6 @@ def test_anything_else_is_refused_in_one_line(call, other):
 def street():
     scene = StreetSettings(frames=3, seed=6, width_px=160, height_px=80, focal_px=90.0)
     return SyntheticSource(scene)
-
-
-def test_a_street_gives_pairs_in_order_poses_and_surfaces(street):
-    pairs, truth = list(street), street.truth
-    assert repr(street) == "SyntheticSource(synthetic street 6, pairs: 3, a rendered street)"
-    assert [pair.index for pair in pairs] == [0, 1, 2]
-    assert [pair.timestamp_s for pair in pairs] == pytest.approx([0.0, 0.1, 0.2])
-    assert np.array_equal(pairs[1].left, street.frame(1).pair.left)
-    assert [pair.index for pair in street.frames(2)] == [2]
-    assert (len(truth.trajectory), truth.surface.frame) == (3, "world")
-    assert street.truth is truth
-    occupancy = street.occupancy_truth(resolution_m=0.5)
-    assert occupancy.grid.resolution_m == 0.5
-    assert occupancy.seen.any()
-    one, two = street.disparity_truth(1), street.frame(1).truth
-    assert np.array_equal(one.values, two.values, equal_nan=True)
-    assert np.array_equal(one.nonocc, two.nonocc)
 
 
 GREY = np.zeros((16, 16), np.uint8)

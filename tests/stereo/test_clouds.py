@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import recon
 from recon.core.errors import ReconError, SettingsError, ShapeError
 from recon.core.values import Disparity, PointCloud, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.camera import project
@@ -218,19 +217,6 @@ def test_slants_below_the_gradient_limit_stay(across, down, noise_seed):
     v, u = np.mgrid[:24, :30]
     noise = np.random.default_rng(noise_seed).uniform(-0.25, 0.25, u.shape)
     assert remove_flying_edges(as_disparity(60 + across * u + down * v + noise)).valid.all()
-
-
-@pytest.mark.parametrize("removed", [True, False])
-def test_removal_can_be_turned_off(removed):
-    class Smeared:
-        def match(self, pair: RectifiedPair) -> Disparity:
-            return Disparity.from_values(smeared_step(2))
-
-    image = np.random.default_rng(0).integers(0, 256, (40, 60), dtype=np.uint8)
-    camera = RectifiedCamera(100.0, 30.0, 20.0, 30.0, 0.1, 60, 40)
-    config = recon.load_config(overrides=[f"cloud.remove_flying_edges={removed}"])
-    found = recon.reconstruct(image, image, camera, config, matcher=Smeared()).disparity
-    assert (Reason.EDGE in found.reason) == removed
 
 
 @pytest.mark.parametrize("shape", [(3, 3), (3, 200), (200, 4)])

@@ -237,16 +237,6 @@ def test_unpacking_inverts_packing(cells):
     assert voxels.unpack_keys(keys).tolist() == [list(cell) for cell in cells]
 
 
-def test_neighbouring_cells_spread_over_the_table():
-    # A street is a sheet of neighbouring cells: probing stays short if they do not cluster.
-    cells = np.stack(np.unravel_index(np.arange(90_000), (300, 300, 1)), axis=1)
-    table = voxels.make_table(len(cells))
-    voxels.enter_keys(table, voxels.pack_keys(cells))
-    empty = np.flatnonzero(table[:, 0] == voxels.EMPTY)
-    # At half load a random hash gives a longest run of some tens; clusters give thousands.
-    assert np.diff(empty).max() < 200
-
-
 @settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from recon.core.errors import CalibrationError, FormatError, ReconError
-from recon.core.geometry.se3 import apply, exp_so3, make_transform
+from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
 from recon.io.cameras.calibration import (
     read_calibration,
@@ -22,7 +22,7 @@ from recon.io.cameras.calibration import (
 )
 from recon.io.cameras.kitti import list_kitti_cameras, read_kitti_calib, read_kitti_offset
 from recon.io.cameras.opencv_yaml import read_opencv_calibration, write_opencv_calibration
-from recon.io.cameras.ros import camera_info_paths, read_kalibr, write_camera_info, write_kalibr
+from recon.io.cameras.ros import write_camera_info, write_kalibr
 from recon.io.images.image import write_image
 from recon.sources.one_pair import read_pair_input
 from recon.sources.registry import open_source
@@ -118,45 +118,6 @@ def test_two_models_in_an_opencv_file_and_what_is_no_calibration_are_refused(tmp
         read_calibration(tmp_path / "h.yaml", 64, 48)
 
 
-def test_a_kalibr_chain_as_its_wiki_prints_it_is_read(tmp_path):
-    """The example of kalibr's wiki page "Yaml formats", with a rigid T_cn_cnm1."""
-    (tmp_path / "chain.yaml").write_text(
-        """cam0:
-  camera_model: pinhole
-  intrinsics: [461.629, 460.152, 362.680, 246.049]
-  distortion_model: radtan
-  distortion_coeffs: [-0.27695497, 0.06712482, 0.00087538, 0.00011556]
-  resolution: [752, 480]
-cam1:
-  camera_model: pinhole
-  intrinsics: [459.2, 457.7, 362.7, 246.0]
-  distortion_model: radtan
-  distortion_coeffs: [-0.27695497, 0.06712482, 0.00087538, 0.00011556]
-  T_cn_cnm1:
-  - [1.0, 0.0, 0.0, -0.110]
-  - [0.0, 1.0, 0.0, 1e-05]
-  - [0.0, 0.0, 1.0, 0.0]
-  - [0.0, 0.0, 0.0, 1.0]
-  resolution: [752, 480]
-"""
-    )
-    read = read_kalibr(tmp_path / "chain.yaml")
-    assert (read.left.matrix[0, 0], read.left.width_px) == (461.629, 752)
-    np.testing.assert_array_equal(read.T_right_left[:3, 3], [-0.11, 1e-5, 0])
-
-
-@pytest.mark.parametrize(
-    ("given", "names"),
-    [
-        ("rig.yaml", ["rig_left.yaml", "rig_right.yaml"]),
-        ("left.yaml", ["left.yaml", "right.yaml"]),
-        ("my_right_cam.yaml", ["my_left_cam.yaml", "my_right_cam.yaml"]),
-    ],
-)
-def test_camera_info_files_are_those_of_left_and_right(given, names):
-    assert [path.name for path in camera_info_paths(given)] == names
-
-
 def swap(left: Path, right: Path) -> None:
     P = yaml.safe_load(right.read_text())["projection_matrix"]["data"]
     right.write_text(right.read_text().replace(repr(P[3]), repr(-P[3])))
@@ -223,15 +184,6 @@ def test_camera_infos_of_a_lens_beside_rectified_images_are_refused_with_the_num
     said = "images are rectified.*--focal .* --baseline 0.12.* --cx 280 --cy 190"
     with pytest.raises(CalibrationError, match=rf"rig_left.yaml: .*{said}"):
         read_calibration(paths[0], 560, 380)
-
-
-def test_a_chain_of_kalibr_that_turns_nothing_is_refused(tmp_path):
-    write_kalibr(tmp_path / "rig.yaml", rig("radtan"))
-    content = yaml.safe_load((tmp_path / "rig.yaml").read_text())
-    content["cam1"]["T_cn_cnm1"] = np.diag([0.0, 0, 0, 1]).tolist()
-    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(content))
-    with pytest.raises(CalibrationError, match="T_cn_cnm1 is not a rotation"):
-        read_calibration(tmp_path / "rig.yaml")
 
 
 ORB_SLAM = "%YAML:1.0\nCamera.fx: 700.0\nCamera.cx: 600.5\nCamera.cy: 180.0\nCamera.bf: 350.0\n"
@@ -600,3 +552,24 @@ def test_a_file_without_a_size_is_refused_if_its_centre_cannot_be_that_of_the_im
     message = r"another size .*principal point at \(70\.5, 21\.5\) of 71x22 pixels.*stores the size"
     with pytest.raises(CalibrationError, match=message):
         read_calibration(path, 71, 22)
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_a_rig_with_left_and_right_swapped_is_refused_as_a_pair_would_be(form, tmp_path):
+    given = rig("none")
+    swapped = StereoCalibration(given.right, given.left, invert(given.T_right_left))
+    path = tmp_path / "rig_left.yaml"
+    if form == "ros":  # whose rectification knows no such rig
+        left, right = write_ros(path, given)
+        left.rename(tmp_path / "third")
+        right.rename(left)
+        (tmp_path / "third").rename(right)
+    else:
+        WRITERS[form](path, swapped)
+    with pytest.raises(CalibrationError, match=r"rig_.*right camera is to the left.*swap"):
+        read_calibration(path)
+    vertical = replace(given, T_right_left=make_transform(np.eye(3), np.array([0.01, -0.12, 0])))
+    if form != "ros":
+        WRITERS[form](path, vertical)
+        with pytest.raises(CalibrationError, match=r"not side by side.*rotate the images"):
+            read_calibration(path, 640, 480)

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import tracemalloc
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,7 +44,7 @@ from recon.core.values import (
 from recon.io.models.columns import write_npz, write_pcd
 from recon.io.models.las import check_crs, check_inside, write_copc, write_e57, write_las
 from recon.io.models.octomap import KEY_LIMIT, octomap_pieces, read_octomap, write_octomap_tiles
-from recon.io.models.ply import read_ply, write_ply
+from recon.io.models.ply import read_ply, write_ply, write_ply_tiles
 from recon.io.models.rasters import (
     RasterPlace,
     read_grid,
@@ -156,17 +157,6 @@ def test_other_clouds_are_read_without_what_is_not_finite_or_no_confidence(tmp_p
     assert read_ply(path).confidence is None
 
 
-@pytest.mark.parametrize("ascii", [False, True])
-def test_a_truncated_cloud_is_refused(tmp_path, ascii):  # noqa: A002
-    path = tmp_path / "cloud.ply"
-    write_ply(path, example_cloud(), ascii=ascii)
-    whole = path.read_bytes()
-    for cut in (40 if ascii else 1, 300):
-        path.write_bytes(whole[:-cut])
-        with pytest.raises(FormatError, match="truncated"):
-            read_ply(path)
-
-
 def test_a_header_of_more_than_memory_and_coordinates_that_would_become_steps_are_refused(tmp_path):
     path = write_raw(tmp_path / "a.ply", XYZ, b"\0" * 24, 10**15, kind="binary_little_endian")
     with pytest.raises(FormatError, match="truncated"):
@@ -177,6 +167,24 @@ def test_a_header_of_more_than_memory_and_coordinates_that_would_become_steps_ar
     with pytest.raises(FormatError, match=r"utm\.ply: .* \(got x up to 4500.*subtract an offset"):
         read_ply(path)
     read_ply(write_raw(path, DOUBLES, (xyz - xyz[0]).astype("<f8").tobytes(), 100, kind))
+
+
+def test_clouds_one_after_another_are_one_cloud_in_a_file_and_an_error_leaves_none(tmp_path):
+    tiles = [example_cloud(7 + 100 * number) for number in range(4)]
+    assert write_ply_tiles(tmp_path / "a.ply", iter(tiles), frame="map") == 628
+    back = read_ply(tmp_path / "a.ply")
+    np.testing.assert_array_equal(back.xyz, np.concatenate([tile.xyz for tile in tiles]))
+    assert back.frame == "map"
+    assert write_ply_tiles(tmp_path / "a.ply", iter([]), frame="map") == 0
+    assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
+
+    def failing() -> Iterator[PointCloud]:
+        yield tiles[0]
+        raise OutputError("disk full")
+
+    with pytest.raises(OutputError):
+        write_ply_tiles(tmp_path / "b.ply", failing(), frame="map")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
 T_SURVEY_MAP = make_transform(

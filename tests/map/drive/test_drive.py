@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.core.errors import MappingError, OutputError, RegistrationError
+from recon.core.errors import MappingError, RegistrationError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import Disparity, PointCloud, RectifiedCamera, RectifiedPair, Trajectory
 from recon.core.values.arrays import Float64
@@ -17,7 +17,6 @@ from recon.map.drive import drive_loops
 from recon.map.drive.drive import MapBehind
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.drive_odometry import doubt_poses
-from recon.map.drive.sequence import map_sequence
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.settings import DriveSettings
 from recon.map.store.records import Store
@@ -25,7 +24,7 @@ from recon.map.store.session import Keyframes
 from recon.odometry.protocol import OdometryHealth, OdometryResult
 from recon.places import places
 from recon.places.closure import DrivePath, close_loops
-from recon.places.detector import CONTRADICTED, LoopDetector, StoredKeyframe
+from recon.places.detector import CONTRADICTED, LoopDetector
 from recon.stereo.frame import ReconstructedFrame
 from recon.street.settings import StreetScene
 from tests.run.pools import observed_pool
@@ -72,15 +71,6 @@ def test_poses_of_a_body_are_recognised(street):
     poses = T_BODY_CAMERA @ street.trajectory.T_world_camera @ invert(T_BODY_CAMERA)
     (line,) = doubts(street, poses)
     assert "as those of a body" in line
-
-
-def test_frames_that_show_nothing_before_the_first_change_no_axes(street):
-    dark = street.taken(slice(0, 2), np.zeros_like)
-    late = Film([*dark.pairs, *street.pairs], street.calibration, np.tile(np.eye(4), (10, 1, 1)))
-    seen, waited = (map_sequence(source, DriveSettings()) for source in (street, late))
-    np.testing.assert_array_equal(waited.T_map_world, seen.T_map_world)
-    assert [(one.first, one.last) for one in waited.segments] == [(2, 9)]
-    assert len(waited.cloud) == len(seen.cloud)
 
 
 GREY = np.zeros((16, 16), np.uint8)
@@ -253,15 +243,6 @@ def test_an_interrupted_drive_gives_the_same_loops(frames, closed, tmp_path, che
     assert np.array_equal(
         loops.closure.trajectory.T_world_camera, closed.closure.trajectory.T_world_camera
     )
-
-
-def test_a_full_disk_is_reported_although_another_thread_met_it(frames, tmp_path, monkeypatch):
-    def full(self: Keyframes, stored: StoredKeyframe) -> None:
-        raise OutputError("the disk is full")
-
-    monkeypatch.setattr(Keyframes, "put", full)
-    with pytest.raises(OutputError, match="full"):
-        _watch(frames, _circle(), upto=1)
 
 
 def test_a_drive_that_fails_does_not_wait_for_its_loops(frames, monkeypatch):

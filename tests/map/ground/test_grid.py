@@ -339,15 +339,6 @@ def test_the_ground_is_found_among_walls_and_boxes(pitch, roll):
         assert abs(T[1, 2]) < 0.03
 
 
-def test_walls_ceilings_and_nothing_are_no_ground():
-    rng = np.random.default_rng(1)
-    x, y = rng.uniform(-5, 5, 8000), rng.uniform(-2, 2, 8000)
-    wall = np.stack([x, y, np.full(8000, 6.0)], 1)
-    ceiling = np.stack([x, np.full(8000, -1.5), rng.uniform(4, 15, 8000)], 1)
-    for xyz in (wall, ceiling, np.zeros((0, 3))):
-        assert estimate_ground(PointCloud(xyz.astype(np.float32))) is None
-
-
 CAMERA_M = 1.6
 PATH = np.stack([np.arange(0, 60, 1.0), np.zeros(60), np.zeros(60)], axis=1)
 
@@ -403,14 +394,6 @@ def test_slopes_are_followed():
     assert of_one_frame.height_at(np.array([[33.0, 2.0]]))[0] == pytest.approx(height_m, abs=0.1)
 
 
-def test_what_is_beyond_the_reach_or_has_no_ground_is_unknown():
-    surface = _surface(_hill(), reach_m=5.0)
-    assert np.isnan(surface.height_at(np.array([[30.0, 9.0], [1e4, -1e4]]))).all()
-    nothing = _surface(np.zeros((0, 3)))
-    assert np.isnan(nothing.heights_m).all()
-    assert math.isnan(nothing.camera_height_m)
-
-
 def test_boxes_and_walls_do_not_lift_the_ground():
     rng = np.random.default_rng(1)
     x, y = rng.uniform(10, 16, 20_000), rng.uniform(3, 6, 20_000)
@@ -448,15 +431,6 @@ def test_heights_are_carried_over_small_gaps_alone(monkeypatch):
     assert np.isfinite(surface.height_at(np.array([[30.0, 2.0], [30.0, -2.0]]))).all()
 
 
-def test_height_is_linear_between_centres_of_cells():
-    surface = GroundSurface(np.array([[0.0, 1.0], [2.0, np.nan]]), 1.0, (10.0, 20.0))
-    places = np.array([[10.5, 20.5], [11.0, 20.5], [10.5, 21.0], [11.5, 21.5], [10.0, 20.0]])
-    heights = surface.height_at(places)
-    assert heights[:3].tolist() == [0.0, 0.5, 1.0]
-    assert math.isnan(heights[3])
-    assert heights[4] == 0.0  # outside of the centres: the nearest cell's
-
-
 EDGE_M = 0.2
 NONE = np.zeros((0, 3), np.float32)
 NOTHING = PointCloud(NONE, normals=NONE, frame="map")
@@ -474,16 +448,6 @@ def _joined(*parts: tuple[np.ndarray, np.ndarray]) -> OccupancyVoxels:
 
 
 ROAD = _columns(range(20), range(5), {-8: 2.0, -7: -1.0, -6: -1.0})
-WALL = _columns(range(20), range(5, 6), dict.fromkeys(range(-8, 4), 2.0))
-
-
-def test_floors_are_occupied_voxels_below_free_ones():
-    added = add_floors(NOTHING, find_floors(_joined(ROAD, WALL)))
-    none = OccupancyVoxels(np.zeros((0, 3), np.int32), np.zeros(0, np.float32), EDGE_M)
-    assert len(find_floors(none)) == len(add_floors(NOTHING, find_floors(none))) == 0
-    assert (len(added), added.xyz[:, 2]) == (100, pytest.approx(-7.5 * EDGE_M))
-    assert added.xyz[:, 1].max() < 1.0
-    assert (added.normals == [0, 0, 1]).all()
 
 
 def test_a_floor_may_share_its_evidence_with_the_voxel_above():

@@ -189,15 +189,6 @@ def test_a_start_pose_narrows_the_search(street, street_map, truth):
             _localized(odd, street_map, wrong)
 
 
-def test_a_single_pair_is_found(street, street_map, truth):
-    found = street_map.localize(street.pairs[9])
-    off = se3.invert(truth[9]) @ found.T_world_camera
-    assert found.state is State.TRACKING
-    assert np.linalg.norm(off[:3, 3]) < 0.3
-    other = film(STREET.model_copy(update={"seed": 5, "frames": 1}))
-    assert street_map.localize(other.pairs[0]).state is State.SEARCHING
-
-
 def test_a_damaged_map_or_one_without_keyframes_is_refused(street, street_map):
     damaged, empty = Map.temporary(), Map.temporary()
     empty.begin(SessionInfo())

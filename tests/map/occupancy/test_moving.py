@@ -157,10 +157,9 @@ def test_what_moved_is_gone(scenes):
     assert _left(trail, drive) <= 0.05
     removed = join_clouds(tile.removed for tile in _tiles(drive))
     assert _near(removed, trail, lowest_m=0.05).mean() > 0.85
-    assert removed.sigma_m is not None
-
-
-KERB: Box = ((-3.0, 0.0, 16.0), (0.3, 0.15, 28.0))
+    # Of what is 3 to 20 m away, each as sure as the points that it was made of.
+    assert (removed.sigma_m > 0).all()
+    assert removed.sigma_m.max() < 0.5
 
 
 def _trail(drive: Drive, scenes: Sequence[Sequence[Box]], ground_m: float, *, remove: bool):
@@ -187,15 +186,6 @@ def test_below_what_moved_is_ground_or_nothing(scenes, ground_m, monkeypatch):
     assert low[1] <= 0.15 * low[0]
     ground = [(np.abs(heights) < 0.05).sum() for heights in (before, after)]
     assert ground[1] >= 0.98 * ground[0] > 1000
-
-
-def test_a_kerb_below_what_moved_stays():
-    drives = _drive([[KERB]] * FRAMES), _drive([[*boxes, KERB] for boxes in ONCOMING])
-    of_kerb = []
-    for drive in drives:
-        height, there = _trail(drive, ONCOMING, -HEIGHT_M, remove=True)
-        of_kerb.append((there & (height > 0.07) & (height < 0.2)).sum())
-    assert of_kerb[1] >= 0.95 * of_kerb[0] > 100
 
 
 def test_what_stands_still_stays_even_if_it_is_thin():
@@ -246,16 +236,6 @@ DRIFT = np.random.default_rng(3).normal(0.0, 0.07, (LESS, 3)).cumsum(axis=0) * [
 def test_what_only_the_error_of_a_rig_or_of_a_path_moves_stays(errors):
     before, after = _clouds(_drive([STREET] * LESS, step_m=0.75, **errors))
     assert len(after) >= 0.995 * len(before)
-
-
-def test_a_car_that_moves_by_more_than_the_error_of_the_rig_is_gone():
-    scenes = ONCOMING[:LESS]
-    trail = [box for boxes in scenes for box in boxes]
-    drive = _drive([[*boxes, STREET[0]] for boxes in scenes], off_px=0.25 * WANDER)
-    before, after = _clouds(drive)
-    assert _near(before, trail).sum() > 100
-    assert _near(after, trail).sum() <= 0.05 * _near(before, trail).sum()
-    assert _near(after, STREET[:1]).sum() >= 0.995 * _near(before, STREET[:1]).sum()
 
 
 @pytest.mark.slow
@@ -330,23 +310,7 @@ def _cells(grid: OccupancyGrid, forward_m: tuple[float, float], left_m: tuple[fl
     return grid.cells[y0:y1, x0:x1]
 
 
-AWAY = [(x, 9.0) for x in np.arange(0.0, 7.1, 0.7)]
 PLACE = (9.0, 13.0), (-1.4, 1.4)
-
-
-@pytest.mark.parametrize(("cars", "step_m", "forward_m", "left_m"), [
-    ([*((-x, 9.0) for x, _ in AWAY[::-1]), *AWAY, *[None] * 3], 0.0, (9.0, 13.0), (-4.0, 4.0)),
-    ([*[(0.0, 9.0)] * 20, *AWAY, *[None] * 20], 0.0, *PLACE),
-    # It drives on faster than the camera: where its rear was, later rays reach its new rear.
-    ([(0.0, 6.0 + 0.8 * n) for n in range(18)], 0.3, (6.0, 17.0), (-1.4, 1.4)),
-], ids=["crosses", "drives away", "leads"])  # fmt: skip
-def test_where_a_car_was_is_free(cars, step_m, forward_m, left_m):
-    grid = _grid(cars, step_m)
-    track = _cells(grid, forward_m, left_m)
-    assert (track == OCCUPIED).sum() == 0
-    assert (track == FREE).mean() > (0.95 if step_m else 0.98)
-    if step_m:
-        assert (_cells(grid, (19.2, 20.4), (-1.0, 1.0)) == OCCUPIED).any()  # where it is now
 
 
 def test_a_car_that_stops_where_it_was_free_is_found_within_a_second():

@@ -19,7 +19,7 @@ from recon.map.sessions.joining import path_up_to
 from recon.map.sessions.placed import PlacedSubmaps
 from recon.map.store.map_file import MapViews
 from recon.map.store.session import Session, SessionInfo
-from recon.map.store.trees import Link
+from recon.map.store.trees import Link, path_of
 from recon.odometry.protocol import OdometryHealth
 from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
@@ -202,16 +202,6 @@ def test_a_finished_map_gives_cloud_and_occupancy_again(tmp_path, closed):
         PlacedSubmaps(lacking, CONFIG)
 
 
-def test_submaps_move_with_their_middle_frames():
-    session = drives(1).session()
-    assert session.corrections() is None
-    path = session.odometry.T_world_camera
-    bent = np.stack([BEND @ T if n % 2 else T for n, T in enumerate(path)])
-    session.set_loops({"closed": [], "refused": [], "T_world_camera": bent})
-    for entry, T in zip(session.submaps.entries, session.corrections(), strict=True):
-        np.testing.assert_allclose(T @ path[entry.middle], bent[entry.middle], atol=1e-9)
-
-
 def test_the_rig_of_a_drive_is_known_to_later_ones_of_the_same_calibration(tmp_path):
     raw, count = as_raw(CAMERA), len(NAMES)
     other = replace(CAMERA, baseline_m=2.0)
@@ -239,3 +229,23 @@ def test_the_rig_of_a_drive_is_known_to_later_ones_of_the_same_calibration(tmp_p
             np.testing.assert_equal(known.fitted.covariance, np.eye(count) / 2)
             assert kept.known_rig(as_raw(CAMERA)).name == "session 2 (drive 2)"
             assert kept.known_rig(other) is None
+
+
+def _poses(row: int, column: int, value: float) -> np.ndarray:
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[1, row, column] = value
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value"), [(0, 1, 0.0011), (3, 0, 1e-9), (0, 3, 1.01e5), (2, 2, -1.0)]
+)
+def test_a_path_with_an_impossible_pose_is_refused(row, column, value):
+    with pytest.raises(FormatError, match=r"impossible pose \(got 1\)"):
+        path_of(_poses(row, column, value), np.arange(3.0))
+
+
+@pytest.mark.parametrize(("row", "column", "value"), [(0, 1, 0.0009), (0, 3, 0.99e5)])
+def test_poses_of_few_digits_and_far_away_are_a_path(row, column, value):
+    poses = _poses(row, column, value)
+    np.testing.assert_array_equal(path_of(poses, np.arange(3.0)).T_world_camera, poses)

@@ -179,15 +179,6 @@ def test_what_is_no_scheduler_is_one_line_and_not_waited_for(protocol, greeting)
         connection.close()
 
 
-def test_what_names_no_scheduler_is_one_line(tmp_path):
-    here = "tcp://127.0.0.1"
-    for address in (f"{here}:9", f"{here}:x", "tcp://", "ucx://x:1", "nonsense", ""):
-        assert_not_reached(address)
-    for content in ("", "[]", "{}", '{"address": 3}'):
-        (tmp_path / "scheduler.json").write_text(content)
-        assert_not_reached(tmp_path / "scheduler.json")
-
-
 def test_a_scheduler_that_goes_and_dask_that_is_not_there_are_one_line(monkeypatch):
     class Gone:
         def nthreads(self) -> None:

@@ -14,11 +14,10 @@ from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
 from recon.stereo.kernels.convolution import UNIT
 from recon.stereo.match import fill, fine, sgm
-from recon.stereo.match.fine import Describer, FineSettings, fine_grey, load_network
+from recon.stereo.match.fine import Describer, fine_grey, load_network
 from recon.stereo.match.registry import MatchingSettings, make_matcher
 
 HEIGHT, WIDTH = 120, 240
-SETTINGS = FineSettings(ndisp=48)
 
 
 def rendered(truth: np.ndarray, texture: np.ndarray, noise: float = 1.0) -> RectifiedPair:
@@ -67,9 +66,10 @@ def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
     plain = np.s_[45:75, 125:140]  # seen without texture in both views
     error = np.abs(found.values - truth)
     filled = found.reason == Reason.FILLED
-    assert filled[plain].mean() > 0.1
+    # Half of it is reached by features of a wide surround, and measured; a fifth is filled.
+    assert 0.15 < filled[plain].mean() < 0.3
+    assert not filled[85:, 60:].any()
     assert (error[plain][filled[plain]] < 1).mean() > 0.95
-    assert filled[45:75, 125:140].mean() > filled[85:, 60:].mean()
     only = sgm.SgmMatcher(sgm.SgmSettings(ndisp=48)).match(pair)
     assert (np.abs(only.values - truth)[plain] < 1).mean() < 0.3
     seen = found.reason == Reason.VALID
@@ -143,15 +143,6 @@ def test_pixels_without_an_image_or_beyond_the_right_one_are_border():
     found = match(replace(rendered(np.full((HEIGHT, WIDTH), 20.0), cloth()), valid=valid))
     assert (found.reason[:, 150:160] == Reason.BORDER).all()
     assert (found.reason[:, :15] == Reason.BORDER).mean() > 0.9
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (2, 3), (40, 60)])
-@pytest.mark.parametrize("level", [0, 255])
-def test_where_nothing_is_seen_nothing_is_filled(shape, level):
-    grey = np.full(shape, level, np.uint8)
-    found = match(RectifiedPair(grey, grey, stand_in_camera(*shape[::-1])))
-    assert found.values.shape == shape
-    assert np.isnan(found.values).all()
 
 
 def test_ranges_of_either_sign_are_searched_and_one_outside_is_refused():

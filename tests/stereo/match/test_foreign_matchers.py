@@ -13,7 +13,6 @@ from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
-from tests.hostile.refusals import assert_refused, run
 
 
 def install_plugin(site, package, modules, points, group="matchers"):
@@ -198,17 +197,6 @@ def test_a_broken_plugin_is_named_in_one_line(name, words):
     assert "of package flat-matcher" in str(raised.value)
 
 
-@pytest.mark.usefixtures("plugin")
-@pytest.mark.parametrize("name", ["leaves", "exiting", "ends"])
-def test_a_command_whose_plugin_exits_with_0_fails(name, tmp_path):
-    for seed, side in enumerate(("left", "right")):
-        cv2.imwrite(str(tmp_path / f"{side}.png"), image(seed))
-    images = (tmp_path / "left.png", tmp_path / "right.png")
-    ended = run("disparity", *images, "--matcher", name, "--out", tmp_path / "out")
-    assert_refused(ended, f"matcher '{name}'", "SystemExit: 0")
-    assert not (tmp_path / "out").exists()
-
-
 NAMES = ("opencv-bm", "opencv-sgbm")
 BOTH = pytest.mark.parametrize("name", NAMES)
 
@@ -255,7 +243,8 @@ def test_nothing_is_matched_beside_the_right_image_without_an_image_or_padding(n
 def test_what_opencv_could_not_match_is_nan_with_a_reason_and_tiny_images_no_error(name):
     left, right = np.random.default_rng(5).integers(0, 256, (2, 60, 160), dtype=np.uint8)
     disparity = match(name, RectifiedPair(left, right, stand_in_camera(160, 60, 32)))
-    assert np.isnan(disparity.values).mean() > 0.5
+    # Chance matches some 9 % of noise.
+    assert 0.85 < np.isnan(disparity.values).mean() < 0.95
     assert Reason.AMBIGUOUS in disparity.reason
     assert not (disparity.values < 0).any()
     for height, width in ((1, 1), (1, 40), (40, 1), (3, 3)):

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.core import errors
-from recon.core.errors import FormatError, MatchingError, MissingDependencyError, SettingsError
+from recon.core.errors import FormatError, MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.network import match_in_tiles, rendered_pair
@@ -119,15 +118,6 @@ def test_a_file_that_is_no_network_and_settings_that_disagree_are_refused(tmp_pa
             OnnxSettings.parse(values)
     with pytest.raises(SettingsError, match=r"matching\.onnx\.model"):
         OnnxMatcher(OnnxSettings()).match(pair_of(1, 2))
-
-
-def test_without_the_extra_pip_is_named(difference, monkeypatch):
-    def absent(name: str) -> None:
-        raise ModuleNotFoundError(name)
-
-    monkeypatch.setattr(errors, "import_module", absent)
-    with pytest.raises(MissingDependencyError, match=r"recon-stereo\[onnx\]"):
-        match(difference, pair_of(1, 2))
 
 
 @pytest.fixture(scope="module")

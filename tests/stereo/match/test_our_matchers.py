@@ -130,8 +130,9 @@ def test_half_occluded_wall_is_occluded_and_not_given_a_value(match):
     core[24:56, 56:62] = True
     # What is behind the square does not reach the end of what is searched there, or it is hidden.
     hidden_there = [Reason.OCCLUDED, Reason.OUT_OF_RANGE]
-    assert np.isin(found.reason[core], hidden_there).mean() > 0.5
-    assert found.valid[core].mean() < 0.2
+    # All of it, but for a few pixels of the semi-global matcher.
+    assert np.isin(found.reason[core], hidden_there).mean() > 0.95
+    assert not found.valid[core].any()
     assert np.nanmedian(found.values[25:55, 80:110]) == pytest.approx(20, abs=0.1)
     assert np.nanmedian(found.values[25:55, 10:45]) == pytest.approx(4, abs=0.1)
 
