@@ -79,7 +79,8 @@ class CheckedOdometry:
         found = explain_motion(*views, T_before_now, camera)
         telling = found.informative >= _MIN_TELLING
         # A visual motion has passed the test of its uncertainty; any other has no other evidence.
-        if found.ratio >= MIN_RATIO if telling else np.isfinite(health.sigma_m):
+        trusted = found.ratio >= MIN_RATIO if telling else np.isfinite(health.sigma_m)
+        if trusted:
             return []
         patches = counted(found.informative, "patch", "patches")
         if telling:
