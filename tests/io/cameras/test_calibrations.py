@@ -15,11 +15,8 @@ import yaml
 from recon.core.errors import CalibrationError, FormatError, ReconError
 from recon.core.geometry.se3 import apply, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, LensModel, RectifiedCamera, StereoCalibration
-from recon.io.cameras.calibration import (
-    read_calibration,
-    read_recon_calibration,
-    write_recon_calibration,
-)
+from recon.io.cameras import calibration as ours
+from recon.io.cameras.calibration import read_calibration
 from recon.io.cameras.kitti import list_kitti_cameras, read_kitti_calib, read_kitti_offset
 from recon.io.cameras.opencv_yaml import read_opencv_calibration, write_opencv_calibration
 from recon.io.cameras.ros import write_camera_info, write_kalibr
@@ -61,7 +58,7 @@ def write_ros(path: Path, calibration: StereoCalibration) -> tuple[Path, Path]:
 
 
 WRITERS: dict[str, Write] = {
-    "recon": write_recon_calibration,
+    "recon": ours.write_recon_calibration,
     "opencv": write_opencv_calibration,
     "ros": write_ros,
     "kalibr": write_kalibr,
@@ -86,14 +83,14 @@ def test_every_format_gives_the_rig_back_whatever_its_name(tmp_path, form, lens)
 
 def test_our_file_is_exact_names_every_unit_and_is_believed(tmp_path):
     camera = RectifiedCamera(1 / 3 + 700, 600.1, 180.7, 610.3, 0.54, 1242, 375, ndisp=96)
-    write_recon_calibration(tmp_path / "c.yaml", camera)
+    ours.write_recon_calibration(tmp_path / "c.yaml", camera)
     assert read_calibration(tmp_path / "c.yaml", camera.width_px, camera.height_px) == camera
-    write_recon_calibration(tmp_path / "c.yaml", rig("radtan"), {"stereo_rms_px": 0.25})
+    ours.write_recon_calibration(tmp_path / "c.yaml", rig("radtan"), {"stereo_rms_px": 0.25})
     text = (tmp_path / "c.yaml").read_text()
     for word in ("fx_px:", "width_px: 640", "translation_m:", "k1: -0.3", "stereo_rms_px: 0.25"):
         assert word in text
     cropped = replace(CAMERA, cy_px=1.0)
-    write_recon_calibration(tmp_path / "crop.yaml", cropped)
+    ours.write_recon_calibration(tmp_path / "crop.yaml", cropped)
     assert read_calibration(tmp_path / "crop.yaml", *RECTIFIED) == cropped
 
 
@@ -108,8 +105,8 @@ def test_two_models_in_an_opencv_file_and_what_is_no_calibration_are_refused(tmp
     mixed = StereoCalibration(rig("fisheye").left, rig("radtan").right, T_RIGHT_LEFT)
     with pytest.raises(CalibrationError, match="two lens models"):
         write_opencv_calibration(tmp_path / "mixed.yml", mixed)
-    write_recon_calibration(tmp_path / "mixed.yaml", mixed)
-    assert read_recon_calibration(tmp_path / "mixed.yaml").left.model == "fisheye"
+    ours.write_recon_calibration(tmp_path / "mixed.yaml", mixed)
+    assert ours.read_recon_calibration(tmp_path / "mixed.yaml").left.model == "fisheye"
     (tmp_path / "notes.txt").write_text("f = 700\n")
     with pytest.raises(FormatError, match=r"notes\.txt: not.*KITTI.*Middlebury.*OpenCV"):
         read_calibration(tmp_path / "notes.txt", 640, 480)
