@@ -157,11 +157,10 @@ def run_map(
             keep_map(map_, run.path(MAP_FILE))
         with run.report(result.summary):
             # Its figures take long to load, and the drive is mapped without them.
-            from recon.report.map_page import map_content  # noqa: PLC0415
+            from recon.report.map_page import map_page  # noqa: PLC0415
             from recon.report.page import write_page  # noqa: PLC0415
 
-            shown = map_content(map_, made, errors, mapped.sample, rig)
-            write_page("map", run, result.summary, **shown)
+            write_page(map_page(map_, made, errors, mapped.sample, rig, result.summary), run)
         config.memory.check("report")
         record = {
             "source_description": source.description,
