@@ -74,7 +74,7 @@ def middlebury(
         from recon.commands.config import PAIR_DEFAULTS
         from recon.commands.evaluate_middlebury import run_middlebury
         from recon.report.middlebury_page import middlebury_tables
-        from recon.report.table import Table, join
+        from recon.report.sections import Table, join
 
         summary = run_middlebury(
             folder,

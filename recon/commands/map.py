@@ -161,11 +161,11 @@ def run_map(
             keep_map(map_, run.path(MAP_FILE))
         with run.report(summary) as summary:
             # Its figures take long to load, and the drive is mapped without them.
-            from recon.report.map_page import map_content  # noqa: PLC0415
+            from recon.report.map_page import map_page  # noqa: PLC0415
             from recon.report.page import write_page  # noqa: PLC0415
 
-            shown = map_content(map_, made, errors, mapped.sample, rig)
-            write_page("map", run, summary.to_json(), **shown)
+            shown = summary.to_json()
+            write_page(map_page(map_, made, errors, mapped.sample, rig, shown), run)
         config.memory.check("report")
         record = {
             "source_description": source.description,

@@ -14,11 +14,11 @@ from recon.io.files import read_text, reading
 from recon.io.models.ply import read_ply
 from recon.io.models.rasters import read_grid
 from recon.map.store.records import check_format, connect
+from recon.report.scene import Scene
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
 from recon.run.finished import CLOUD, GRID, command_of_map, figure_of, states_of
 from recon.run.run import SUMMARY
-from recon.view.scene import Scene, cut
-from recon.view.server import Viewer
+from recon.view.server import Viewer, cut
 
 _TURN_S: Final = 0.2  # between two looks at whether there is anything new
 _TURNS: Final = 25  # that are waited for a browser
@@ -91,4 +91,4 @@ def read_products(run: Path) -> Scene:
     cloud, grid, spacing_m = run / CLOUD, run / GRID, voxel_m or 0.1  # merged: unsaid
     points = cut(read_ply(cloud), spacing_m) if cloud.is_file() else ()
     grids = ((read_grid(grid), ground_m),) if grid.is_file() else ()
-    return Scene([str(run), *lines], points, spacing_m, grids)
+    return Scene(points, grids=grids, lines=[str(run), *lines], spacing_m=spacing_m)

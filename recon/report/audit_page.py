@@ -15,7 +15,8 @@ from recon.look.sample import PairMeasures
 from recon.report import style
 from recon.report.page import write_page
 from recon.report.pair_page import disparity_figure, is_wide, pair_figure
-from recon.report.rig_part import rig_content
+from recon.report.rig_part import rig_section
+from recon.report.sections import Image, Page, Section, Table, known
 from recon.rig.audit import Audit
 from recon.run.directory import RunDirectory
 from recon.sources.source import StereoSource
@@ -29,29 +30,39 @@ def write_audit_page(
     audit: Audit, source: StereoSource, matcher: Matcher, run: RunDirectory
 ) -> None:
     """Write ``report.html`` of an audit; ``matcher`` finds the disparities of its sample pairs."""
-    write_page(
-        "audit",
-        run,
-        audit.summary.to_json(),
-        source=source,
-        lines=audit_lines(audit.summary.to_json()),
-        rig=rig_content(audit.rig),
-        frames=frames_figure(audit.pairs) if audit.pairs else None,
-        pairs=[_pair(look, look.shown, matcher) for look in audit.pairs if look.shown is not None],
-        warnings=[finding.text for finding in audit.findings],
-    )
+    found, frames = audit.summary.to_json(), frames_figure(audit.pairs) if audit.pairs else None
+    lines, caption = audit_lines(found), "Of the measured pairs, evenly spread over the recording."
+    looked_at = [(look, look.shown) for look in audit.pairs if look.shown is not None]
+    sections = [
+        Section("Measured", [Table("All checks", (), [*lines.items()])]),
+        rig_section(audit.rig),
+        Section("By frame", [Image("Exposure, focus and epipolar error", frames, caption)]),
+        *(_pair_section(look, pair, matcher) for look, pair in looked_at),
+    ]
+    depths_m, rig = found.get("depth_error_m"), found.get("rig_by_motion")
+    off_percent = rig["depth_percent"]["10"]["mean"] if rig else None
+    figures = [
+        ("Epipolar error (RMS)", known("{:.2f} px", found["epipolar_error_rms_px"])),
+        ("Baseline", known("{:.4g} m", found["baseline_m"])),
+        ("Depth error at 10 m, by noise", f"{100 * depths_m['10']:.2g} cm" if depths_m else ""),
+        ("Depth at 10 m, by the rig", known("{:+.1f} %", off_percent)),
+    ]
+    subtitle, texts = f"{source.description}, {lines['frames']}", [x.text for x in audit.findings]
+    write_page(Page(f"Audit of {source.name}", subtitle, figures, sections, found, texts), run)
 
 
-def _pair(look: PairMeasures, pair: RectifiedPair, matcher: Matcher) -> dict[str, Any]:
+def _pair_section(look: PairMeasures, pair: RectifiedPair, matcher: Matcher) -> Section:
     disparity = matcher.match(pair)
-    return {
-        "index": look.index,
-        "wide": is_wide(disparity.values.shape),
-        "images": pair_figure(pair),
-        "rows": epipolar_figure(look, pair) if len(look.features) else None,
-        "disparity": disparity_figure(disparity, pair.camera),
-        "valid_percent": 100 * disparity.measured.mean(),
-    }
+    percent = 100 * disparity.measured.mean()
+    return Section(f"Pair {look.index}", [
+        Image("Images", pair_figure(pair), "Rectified, as the matcher gets them."),
+        Image("Epipolar errors", epipolar_figure(look, pair) if len(look.features) else None,
+              "Each matched feature with its epipolar error, right minus left, drawn "
+              f"{_LONGER:g} times as long. Lines of one direction are a calibration that is off; "
+              "of any, noise."),
+        Image("Disparity", disparity_figure(disparity, pair.camera),
+              f"Red is near, blue is far; {percent:.0f} % of the pixels have a value."),
+    ])  # fmt: skip
 
 
 @style.styled

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ from matplotlib.axes import Axes
 from recon.io.atomic import write_bytes, write_text
 from recon.report import style
 from recon.report.page import write_page
-from recon.report.table import NOT_KNOWN, Table, csv_text, join
+from recon.report.sections import NOT_KNOWN, Image, Page, Section, Table, csv_text, join, known
 from recon.run.batch.job import LOGS
 from recon.run.batch.results import JobResult, accuracies, wrong_first
 from recon.run.directory import RunDirectory
@@ -24,6 +25,12 @@ _COLUMNS: Final = (
     "frames_not_trusted", "points", "peak_memory_mb",
 )  # fmt: skip
 _PANEL_IN: Final = 3.2
+_JOBS: Final = (
+    "Failed ones first, then those with the largest fraction of frames that are not trusted, then "
+    "with the largest drift. A remark says what is much worse than in other jobs of the same "
+    "command and settings, or else what a job was warned of first. Links lead to the report of a "
+    "run, where its command writes one, and of a failed job to its log."
+)
 
 
 def write_batch_page(
@@ -38,10 +45,24 @@ def write_batch_page(
     if sweep:
         write_bytes(run.path("sweep.png"), sweep)
     first = wrong_first(results)
-    pages = {one.job.name: _page(one, run.folder) for one in first}
+    links = {one.job.name: _link(one, run.folder) for one in first}
+    tables = [replace(table, links=links) for table in batch_tables(first)]
+    what = "A point is a job, the line goes through the medians; other swept settings vary along."
+    sections = [
+        Section("Sweep", [Image("What each setting did", sweep, what)]),
+        Section("Jobs", tables, _JOBS),
+    ]
+    figures = [
+        ("Jobs that succeeded", str(summary["succeeded"])),
+        ("Jobs that failed", str(summary["failed"])),
+        ("Storage, GB", f"{summary['bytes'] / 1e9:.3g}"),
+        ("Jobs per hour", known("{:.0f}", summary["jobs_per_hour"])),
+    ]
     failed = [f"{one.job.name}: {one.last.error}" for one in first if one.failed]
-    shown = {"tables": batch_tables(first), "pages": pages, "sweep": sweep}
-    write_page("batch", run, summary, **shown, warnings=[*failed, *summary["warnings"]])
+    warnings = [*failed, *summary["warnings"]]
+    title = f"Batch: {summary['succeeded']} of {len(summary['jobs'])} jobs"
+    subtitle = f"{summary['failed']} failed, {summary['seconds']:.0f} s"
+    write_page(Page(title, subtitle, figures, sections, summary, warnings), run)
 
 
 def batch_tables(results: Sequence[JobResult]) -> list[Table]:
@@ -109,7 +130,7 @@ def _draw(axes: Axes, jobs: Sequence[JobResult], setting: str, name: str) -> Non
     axes.legend()
 
 
-def _page(one: JobResult, folder: Path) -> str:
+def _link(one: JobResult, folder: Path) -> str:
     """Return what to look at of a job: its report, else its figures; its log if it failed."""
     if not one.ok:
         return f"{LOGS}/{one.job.name}.log" if one.failed else ""

@@ -8,12 +8,14 @@ from typing import Any, Final
 import numpy as np
 from matplotlib import colormaps
 
+from recon.core.text import counted
 from recon.core.values import StereoPair
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_bytes
 from recon.io.images.image import read_image
 from recon.report import style
-from recon.report.page import write_page
+from recon.report.page import run_section, write_page
+from recon.report.sections import Image, Page, Section, Table, known, row_of
 from recon.rig.calibrate.stereo import CONFIDENCE, MATCH_SIGMA_PX
 from recon.rig.calibrate.verdict import CalibrationResult, shared_pixels
 from recon.rig.rectification import RectifyResult
@@ -23,19 +25,55 @@ from recon.stereo.rectify.rectifier import Rectifier
 
 Sides = Sequence[Any]  # one value for the left image, one for the right
 _CELLS: Final = (8, 6)
+_DEPTH_ERRORS: Final = ("calibration", "low", "high", "matching")
 
 
 def write_calibration_page(result: CalibrationResult, run: RunDirectory) -> None:
     """Write ``report.html`` of a calibration, and its images."""
-    figures = {
+    found, drawn = result.summary.to_json(), {
         "coverage": coverage_figure(result),
         "view_errors": errors_figure(result),
         **_epipolar_pictures(result),
         "epipolar_errors": epipolar_figure(result),
         "depth_error": depth_error_figure(result),
-    }
-    _write_pictures(figures, run)
-    write_page("calibration", run, result.summary.to_json(), figures=figures)
+    }  # fmt: skip
+    _write_pictures(drawn, run)
+    columns = [("{:.3g}", name) for name in _DEPTH_ERRORS]
+    rows = [row_of(f"{z} m", error, columns) for z, error in found["depth_error_cm"].items()]
+    sections = [
+        Section("Fit", [
+            Image("Each view", drawn["view_errors"],
+                  "Dashed: rms over all corners of both images."),
+            Image("Where the board was", drawn["coverage"],
+                  "One colour per view. Where there are no corners, distortion is a guess."),
+        ]),
+        Section("Rectified", [
+            Image("Epipolar lines, as recorded", drawn["epipolar_raw"],
+                  "A point in one image lies on the line of its colour in the other."),
+            Image("Epipolar lines, rectified", drawn["epipolar_rectified"],
+                  "Rows of the left image, drawn across both."),
+            Image("Epipolar errors", drawn["epipolar_errors"],
+                  "Over all corners of all views; a matcher needs less than half a pixel."),
+        ]),
+        Section("Expected depth error", [
+            Image("Depth error", drawn["depth_error"],
+                  "The larger of the two lines dominates."),
+            Table("Depth error in cm", ("depth", *_DEPTH_ERRORS), rows, caption=(
+                "calibration: systematic error, rms over the image. low, high: its "
+                f"{100 * CONFIDENCE:.0f} % interval in the middle of the image. matching: error "
+                f"of a match that is off by {MATCH_SIGMA_PX:g} px.")),
+        ]),
+        run_section(found),
+    ]  # fmt: skip
+    figures = [
+        ("Reprojection error (RMS)", known("{:.3f} px", found["stereo_rms_px"])),
+        ("Epipolar error, rectified", known("{:.3f} px", found["epipolar_px"])),
+        ("Baseline", known("{:.4g} m", found["baseline_m"])),
+        ("Focal length", known("{:.2f} px", found["focal_px"])),
+    ]
+    views = f"{found['views_used']} of {counted(found['views'], 'view')}"
+    subtitle = f"{found['board']}, {views}, lens {found['model']}"
+    write_page(Page("Stereo calibration", subtitle, figures, sections, found), run)
 
 
 def _epipolar_pictures(result: CalibrationResult) -> dict[str, bytes]:

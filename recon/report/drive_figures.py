@@ -148,7 +148,6 @@ def grid_figure(grid: OccupancyGrid, paths: Mapping[str, Float64]) -> bytes:
     axes.grid(visible=False)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set(xlabel=_MAP_LABELS[0], ylabel=_MAP_LABELS[1])
-    _draw_scale_bar(axes, low, high - low)
     colours = (style.GRID_FREE, style.GRID_OCCUPIED, style.GRID_UNKNOWN)
     keys = map(style.colour_key, ("free", "occupied", "unknown"), colours)
     named = lines if len(lines) > 1 else []
@@ -217,21 +216,6 @@ def _crop_to_known(grid: OccupancyGrid) -> OccupancyGrid:
     x, y = grid.origin_m
     origin_m = (x + left * grid.resolution_m, y + top * grid.resolution_m)
     return OccupancyGrid(grid.cells[top:bottom, left:right], grid.resolution_m, origin_m)
-
-
-def nice_length(target: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is at most ``target`` (> 0)."""
-    power = 10.0 ** math.floor(math.log10(target))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= target * (1 + 1e-9))
-
-
-def _draw_scale_bar(axes: Axes, low: NDArray[Any], size_m: NDArray[Any]) -> None:
-    length = nice_length(float(size_m[0]) / 6)
-    left, bottom = low + size_m * (0.03, 0.06)
-    look: dict[str, Any] = {"color": style.INK, "linewidth": 4, "solid_capstyle": "butt"}
-    axes.plot([left, left + length], [bottom, bottom], **look)
-    middle = (left + length / 2, bottom)
-    axes.annotate(f"{length:g} m", middle, (0, 5), textcoords="offset points", ha="center")
 
 
 def thin_grid(grid: OccupancyGrid, limit: int) -> OccupancyGrid:

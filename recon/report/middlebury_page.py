@@ -8,7 +8,7 @@ from itertools import product
 from typing import Any, Final
 
 import numpy as np
-from PIL import Image
+import PIL.Image
 
 from recon.core.text import counted
 from recon.core.values.arrays import UInt8
@@ -20,7 +20,19 @@ from recon.io.images.image import write_image
 from recon.report import style
 from recon.report.page import write_page
 from recon.report.pair_page import ERROR_LIMIT_PX
-from recon.report.table import NOT_KNOWN, Row, Table, csv_text, join, number
+from recon.report.sections import (
+    NOT_KNOWN,
+    Image,
+    Page,
+    Row,
+    Section,
+    Table,
+    at,
+    csv_text,
+    join,
+    known,
+    number,
+)
 from recon.run.directory import RunDirectory
 
 Figures = Mapping[str, Any]  # as in ``summary.json``
@@ -28,6 +40,13 @@ Path = tuple[str, ...]  # keys of a figure in them
 _WIDTH_PX: Final = 300  # largest width of an image in the report
 _GAP_PX: Final = 6
 _LEAST_RATIO: Final = 0.001
+_ABOUT: Final = (
+    "bad and invalid in per cent of the pixels; avgerr, rms and a50 to a99 in pixels of the full "
+    "size. nonocc: pixels that both cameras see; all: occluded ones too. dense: with holes filled; "
+    "sparse: only pixels with a value. Of measured and of inferred pixels alone: fraction of the "
+    "pixels, and of these those that are wrong, by more than 3 px of the map. ece, ause and sigma: "
+    "docs/evaluation.md."
+)
 
 
 def draw_result(result: SceneResult, run: RunDirectory) -> None:
@@ -49,17 +68,28 @@ def write_middlebury_page(summary: Mapping[str, Any], run: RunDirectory) -> None
     for suffix, form in (("txt", Table.text), ("md", Table.markdown), ("tex", Table.latex)):
         write_text(run.path(f"tables.{suffix}"), join(map(form, tables)))
     write_text(run.path("figures.csv"), csv_table(summary))
-    found = {name: one["weighted"]["confidence"] for name, one in summary["matchers"].items()}
-    rated = {name: curves for name, curves in found.items() if curves}
-    write_page(
-        "middlebury",
-        run,
-        summary,
-        tables=tables,
-        reliability=reliability_figure(rated) if rated else None,
-        sparsification=sparsification_figure(rated) if rated else None,
-        scenes=[_scene(name, summary, run) for name in scene_names(summary["matchers"])],
-    )
+    matchers = summary["matchers"]
+    curves = {name: one["weighted"]["confidence"] for name, one in matchers.items()}
+    rated = {name: one for name, one in curves.items() if one}
+    network = [(name, str(value)) for name, value in (summary.get("network") or {}).items()]
+    scenes = scene_names(matchers)
+    sections = [
+        Section("Tables", [*tables, Table("Network of onnx", ("what", "value"), network)], _ABOUT),
+        Section("Confidence", [
+            Image("Reliability", reliability_figure(rated) if rated else None,
+                  "A pixel is right if it is off by at most one pixel of the map. Above the dashed "
+                  "line, pixels are right more often than the confidence says. Matchers without a "
+                  "confidence are left out."),
+            Image("Sparsification", sparsification_figure(rated) if rated else None,
+                  "The closer to the dotted line, the better the confidence ranks the errors."),
+        ]),
+        Section("Scenes", [_scene(name, summary, run) for name in scenes]),
+    ]  # fmt: skip
+    bad = {n: at(one, "weighted", "nonocc", "dense", "bad", "2") for n, one in matchers.items()}
+    figures = [(f"{n}: bad 2, nonocc, dense", known("{:.1f} %", x)) for n, x in bad.items()]
+    subtitle = f"{counted(len(scenes), 'scene')} of {summary['folder']}, {summary['seconds']:.0f} s"
+    title = f"Middlebury: {', '.join(matchers)}"
+    write_page(Page(title, subtitle, figures, sections, summary), run)
 
 
 @style.styled
@@ -103,22 +133,27 @@ def _floats(curves: Figures, *names: str) -> Any:
     return np.array([curves[name] for name in names], dtype=np.float64)  # None becomes NaN
 
 
-def _scene(scene: str, summary: Mapping[str, Any], run: RunDirectory) -> dict[str, Any]:
+def _scene(scene: str, summary: Mapping[str, Any], run: RunDirectory) -> Image:
     """Return disparity and error of each matcher, row by row."""
     names = [name for name, found in summary["matchers"].items() if scene in found["scenes"]]
     rows = [np.hstack(_small_images(run, f"pictures/{name}/{scene}")) for name in names]
     buffer = io.BytesIO()
-    Image.fromarray(np.vstack(rows)[:-_GAP_PX, :-_GAP_PX]).save(buffer, "PNG")
-    return {"name": scene, "matchers": names, "png": buffer.getvalue()}
+    PIL.Image.fromarray(np.vstack(rows)[:-_GAP_PX, :-_GAP_PX]).save(buffer, "PNG")
+    caption = (
+        f"From top to bottom: {', '.join(names)}. Left the disparity, right its error: blue is "
+        f"right, red is off by {ERROR_LIMIT_PX:g} full-size pixels or more, black is unknown, "
+        "hatched is inferred from planes around."
+    )
+    return Image(scene, buffer.getvalue(), caption)
 
 
 def _small_images(run: RunDirectory, stem: str) -> list[UInt8]:
     """Return disparity and error in one size, with a white strip to the right and below."""
-    images = [Image.open(run.path(f"{stem}_{name}.png")) for name in ("disparity", "error")]
+    images = [PIL.Image.open(run.path(f"{stem}_{name}.png")) for name in ("disparity", "error")]
     width, height = images[1].size  # that of the ground truth
     shown = min(_WIDTH_PX, width)
     size = (shown, max(1, round(height * shown / width)))
-    small = [np.asarray(image.resize(size, Image.Resampling.NEAREST)) for image in images]
+    small = [np.asarray(image.resize(size, PIL.Image.Resampling.NEAREST)) for image in images]
     strips = ((0, _GAP_PX), (0, _GAP_PX), (0, 0))
     return [np.pad(image, strips, constant_values=255) for image in small]
 
@@ -147,7 +182,7 @@ def middlebury_tables(summary: Figures) -> list[Table]:
         tables.append(_scene_table(title, matchers, ("nonocc", "dense", *path)))
     rated = {name: one["weighted"].get("confidence") for name, one in matchers.items()}
     if any(rated.values()):
-        rows = [(m, *(number(_at(one, (n,)), 3) for n in _CONFIDENCE)) for m, one in rated.items()]
+        rows = [(m, *(number(at(one, n), 3) for n in _CONFIDENCE)) for m, one in rated.items()]
         # The shares within sigma are best near those of a normal distribution, not at 0.
         title = f"Confidence, {mean.lower()}, all, sparse"
         tables.append(Table(title, ("matcher", *_CONFIDENCE), rows))
@@ -176,7 +211,7 @@ def csv_table(summary: Figures) -> str:
                     *((*kind, "depth", name) for name in _DEPTHS),
                     *((rated, name) for name in _CONFIDENCE),
                 ]
-                cells = [_at(figures, path) for path in paths]
+                cells = [at(figures, *path) for path in paths]
                 texts = ["" if cell is None else f"{cell:.6g}" for cell in cells]
                 rows.append([matcher, scene, *kind, *texts, figures["seconds"]])
     return csv_text(rows)
@@ -189,22 +224,14 @@ def _columns(mask: str, holes: str) -> dict[str, Path]:
     return {**bad, "invalid": (mask, "invalid"), **lengths}
 
 
-def _at(figures: Figures, path: Path) -> Any:
-    """Return a figure by its keys; None where there is none."""
-    found: Any = figures
-    for key in path:
-        found = (found or {}).get(key)
-    return found
-
-
 def _weighted_table(title: str, matchers: Figures, kind: tuple[str, str]) -> Table:
     columns = _columns(*kind)
     rows: list[Row] = []
     for name, found in matchers.items():
         figures = found["weighted"]
-        depth = number(_at(figures, (*kind, "depth", "median_percent")))
+        depth = number(at(figures, *kind, "depth", "median_percent"))
         shown = depth if depth == NOT_KNOWN else f"{depth} %"
-        cells = [number(_at(figures, path)) for path in columns.values()]
+        cells = [number(at(figures, *path)) for path in columns.values()]
         rows.append((name, *cells, shown, number(figures["seconds"], 3)))
     return Table(title, ("matcher", *columns, "depth error", "seconds"), rows, best="columns")
 
@@ -213,9 +240,9 @@ def _kind_table(title: str, matchers: Figures, mask: str) -> Table:
     rows = []
     for name, kind in product(matchers, KINDS):
         found = matchers[name]["weighted"]
-        cells = (_at(found, (mask, kind, *path)) for path in (("ratio",), ("bad", "2"), ("wrong",)))
+        cells = (at(found, mask, kind, *path) for path in (("ratio",), ("bad", "2"), ("wrong",)))
         # Of all pixels, occluded ones too.
-        ece = _at(found, ("confidence", f"ece_{kind}")) if mask == "all" else None
+        ece = at(found, "confidence", f"ece_{kind}") if mask == "all" else None
         rows.append((f"{name}, {kind}", *map(number, cells), number(ece, 3)))
     return Table(title, ("matcher", "share (%)", "bad 2 (%)", "wrong (%)", "ece"), rows)
 
@@ -223,7 +250,7 @@ def _kind_table(title: str, matchers: Figures, mask: str) -> Table:
 def _scene_table(title: str, matchers: Figures, path: Path, digits: int = 2) -> Table:
     """Return one row per scene, one column per matcher."""
     rows = [
-        (scene, *(number(_at(one, ("scenes", scene, *path)), digits) for one in matchers.values()))
+        (scene, *(number(at(one, "scenes", scene, *path), digits) for one in matchers.values()))
         for scene in scene_names(matchers)
     ]
     return Table(title, ("scene", *matchers), rows, best="rows")

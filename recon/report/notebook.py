@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import base64
 import html as text
+import io
 from collections.abc import Callable
 from typing import Any, Final
 
-import numpy as np
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
-from numpy.typing import NDArray
+from PIL import Image
 
-from recon.core.geometry.se3 import apply
 from recon.core.values import Disparity, OccupancyGrid, PointCloud, Trajectory, TriangleMesh
 from recon.report import style
-from recon.report.scene import T_UPRIGHT_CAMERA, thin_cloud, thin_mesh
+from recon.report.scene import Points, Scene, upright_scene
+from recon.report.view3d import draw_still, view_of
 
 _SIZE_IN: Final = (7.0, 4.8)
-_MOST: Final = 20_000  # points or faces: as many as can be told apart in a picture
+_MOST: Final = 60_000  # points: as many as can be told apart in a picture
 
 
 class Picture(Figure):
@@ -71,31 +70,21 @@ def _draw_path(figure: Figure, path: Trajectory) -> None:
 
 
 def _draw_cloud(figure: Figure, cloud: PointCloud) -> None:
-    if len(cloud) > _MOST:
-        cloud = thin_cloud(cloud, _MOST)
-    xyz = cloud.xyz if cloud.frame == "map" else apply(T_UPRIGHT_CAMERA, cloud.xyz)
-    colours = xyz[:, 2] if cloud.rgb is None else cloud.rgb / 255
-    _upright(figure, xyz).scatter(*xyz.T, c=colours, s=1, depthshade=False)
+    in_map = cloud.frame == "map"
+    _draw_scene(figure, Scene((Points("cloud", cloud),)) if in_map else upright_scene(cloud))
 
 
 def _draw_mesh(figure: Figure, mesh: TriangleMesh) -> None:
     """Draw a mesh in map axes; one in those of a camera lies on its back."""
-    thin, axes = thin_mesh(mesh, _MOST), _upright(figure, mesh.vertices)
-    grey = np.full(thin.faces.shape, 200.0)
-    colours = (grey if thin.rgb is None else thin.rgb[thin.faces].mean(axis=1)) / 255
-    look = {"facecolors": colours, "edgecolors": colours, "shade": thin.rgb is None}
-    if len(thin.faces):
-        axes.add_collection3d(Poly3DCollection(thin.vertices[thin.faces], **look))
+    _draw_scene(figure, Scene(mesh=mesh))
 
 
-def _upright(figure: Figure, xyz: NDArray[Any]) -> Any:
-    axes: Any = figure.add_subplot(projection="3d", elev=35, azim=-160, proj_type="persp")
-    axes.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)")
-    if len(xyz):
-        axes.auto_scale_xyz(*xyz.T)
-        axes.set_aspect("equal")
-    axes.locator_params(axis="z", nbins=3)
-    return axes
+def _draw_scene(figure: Figure, scene: Scene) -> None:
+    axes = figure.subplots()
+    axes.set_axis_off()
+    if not scene.empty:
+        with Image.open(io.BytesIO(draw_still(view_of(scene, _MOST)))) as image:
+            axes.imshow(image)
 
 
 _DRAWN: Final[dict[type, Callable[[Figure, Any], None]]] = {

@@ -1,4 +1,4 @@
-"""A report as one self-contained HTML file: fills the template of a page."""
+"""A page of a report as one self-contained HTML file, and what all pages share."""
 
 from __future__ import annotations
 
@@ -7,81 +7,113 @@ import functools
 import gzip
 import io
 import json
-import math
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from PIL import Image
+import PIL.Image
+import yaml
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from plotly.offline import get_plotlyjs
 
 from recon.core.machine import versions
-from recon.core.text import counted, metres, with_unit
+from recon.core.summary import to_json
+from recon.core.text import counted
 from recon.io.atomic import write_text
 from recon.report import style
-from recon.report.still import draw_still
-from recon.report.table import NOT_KNOWN
+from recon.report.scene import Scene
+from recon.report.sections import Page, Section, Table, Text, View3D, is_number, known
+from recon.report.view3d import draw_still, plot, view_of
 from recon.run.directory import RunDirectory
 
 _WEBP_QUALITY: Final = 80
 _WEBP_METHOD: Final = 2  # in less than half of the time of the usual 4, a twentieth larger
 _WEBP_MOST_PX: Final = 16_383  # a side of a picture, by its format
-_NOT_TABULATED: Final = frozenset({"stages", "warnings", "findings"})
+_SAID_ELSEWHERE: Final = frozenset({"stages", "warnings", "findings"})
 
 
-def write_page(name: str, run: RunDirectory, found: Mapping[str, Any], /, **content: Any) -> None:
-    """Write ``report.html`` of a run; ``content`` overrides warnings and verdict of its summary."""
-    path, verdict = run.path("config.yaml"), found.get("verdict", "")
-    page = {
-        "found": found,
-        "warnings": found.get("warnings", ()),
-        "verdict": verdict,
-        "sound": verdict == "good",
-        "command": command_line(),
-        "config": path.read_text(encoding="utf-8") if path.is_file() else "",
-        "versions": versions(),
-    }
-    write_text(run.path("report.html"), render_page(name, **{**page, **content}))
+def write_page(page: Page, run: RunDirectory) -> None:
+    """Write ``report.html`` of a run."""
+    path = run.path("config.yaml")
+    config = path.read_text(encoding="utf-8") if path.is_file() else ""
+    write_text(run.path("report.html"), render_page(page, command_line(), config, versions()))
 
 
-def render_page(name: str, **content: Any) -> str:
-    """Render a page as one HTML document without any external resource; all text is escaped.
+def render_page(
+    page: Page, command: str = "", config: str = "", versions: Mapping[str, str] | None = None
+) -> str:
+    """Render a page as one HTML document without any external resource; all text is escaped."""
+    verdict = page.found.get("verdict", "")
+    warnings = page.found.get("warnings", ()) if page.warnings is None else page.warnings
+    counts = counted(len(warnings), "warning") if warnings else "No warnings"
+    packages = "\n".join(f"{name} {version}" for name, version in (versions or {}).items())
+    made = [Text("Configuration", config), Text("Versions", packages)]
+    kept = [one for one in (*page.sections, Section("How it was made", made)) if one.shown]
+    in_3d = any(isinstance(block, View3D) for section in kept for block in section.shown)
+    return _template().render(
+        page=page,
+        sections=kept,
+        warnings=warnings,
+        notice=f"Verdict: {verdict}" if verdict else counts,
+        # Of what is good, warnings are remarks.
+        alarming=verdict != "good" and bool(warnings or verdict),
+        command=command,
+        plotly=_packed_plotly() if in_3d else "",
+    )
 
-    All templates know ``warnings``, ``verdict`` (heading of the warnings; "" counts them),
-    ``sound`` (they are remarks on a good result, in green), ``command``, ``config``, ``versions``.
-    """
-    return page_environment().get_template(f"{name}.html.j2").render(content)
 
-
-def page_environment() -> Environment:
-    """Make Jinja with our templates and filters, for one page."""
+@functools.cache
+def _template() -> Template:
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).with_name("templates")),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        extensions=["jinja2.ext.do"],
     )
-    environment.tests["finite"] = _is_number
     environment.filters.update(
-        counted=counted, embedded=_embedded, leaves=summary_rows, timing=_timing,
-        known=lambda value, form: NOT_KNOWN if value is None else form % value,
-        last_part=lambda name: Path(name).name or name, shortest="{:.3g}".format, still=draw_still,
+        embedded=embedded,
+        drawn=_drawn,
         # A line may break between the words of the name of a figure.
         words=re.compile(r"(?<=[._])(?=[a-z])").split,
-    )  # fmt: skip
-    # Sections add their titles to the contents.
-    environment.globals.update(
-        warnings=(), verdict="", sound=False, command="", config="", versions={}, contents=[],
-        plotly=_packed_plotly, metres=metres,
-    )  # fmt: skip
-    return environment
+    )
+    return environment.get_template("page.html.j2")
+
+
+def _drawn(block: View3D) -> dict[str, Any]:
+    view = view_of(block.scene or Scene(), block.max_points)
+    return {"plot": plot(view), "still": draw_still(view)}
+
+
+def run_figures(found: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return what a run took."""
+    return [
+        ("Run time", known("{:.1f} s", found.get("seconds"))),
+        ("Peak memory", known("{:,.0f} MB", found.get("peak_memory_mb"))),
+    ]
+
+
+def run_section(found: Mapping[str, Any]) -> Section:
+    """Return the time of each stage, and every figure of a summary."""
+    stages = {name: s for name, s in (found.get("stages") or {}).items() if is_number(s)}
+    total = max(sum(stages.values()), 1e-12)
+    rows = [(name, f"{s:.2f} s", f"{100 * s / total:.0f} %") for name, s in stages.items()]
+    note = "Wall-clock time of each stage. Stages that run in parallel are all counted."
+    rest = {key: value for key, value in found.items() if key not in _SAID_ELSEWHERE}
+    plainly = json.loads(json.dumps(to_json(rest)))  # numpy's numbers, too
+    figures = yaml.safe_dump(plainly, sort_keys=False, allow_unicode=True, default_flow_style=None)
+    return Section("Run", [
+        Table("Time by stage", ("stage", "time", "of all"), rows, caption=note),
+        Text("All figures", figures if rest else ""),
+    ])  # fmt: skip
+
+
+def last_part(name: str) -> str:
+    """Return the name of a file or folder without where it is."""
+    return Path(name).name or name
 
 
 def command_line() -> str:
@@ -92,86 +124,36 @@ def command_line() -> str:
     return shlex.join(["recon", *sys.argv[1:]]) if ours else ""
 
 
-def summary_rows(summary: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, str]]:
-    """Return names and texts of a nested mapping, one row per leaf."""
-    rows: list[tuple[str, str]] = []
-    for key, value in summary.items():
-        if not prefix and key in _NOT_TABULATED:
-            continue
-        if isinstance(value, Mapping):
-            rows += summary_rows(value, f"{prefix}{key}.")
-        elif isinstance(value, Sequence) and any(isinstance(item, Mapping) for item in value):
-            rows += summary_rows(dict(enumerate(value)), f"{prefix}{key}.")
-        else:
-            name, text = f"{prefix}{key}", _text(value)
-            unitless = value is None or isinstance(value, str | bool) or value == []
-            rows.append((name, text if unitless else with_unit(text, name)))
-    return rows
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return NOT_KNOWN
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return ", ".join(_text(item) for item in value) or "none"
-    return str(value)
-
-
-def _timing(summary: Mapping[str, Any]) -> bytes:
-    stages = {name: s for name, s in (summary.get("stages") or {}).items() if _is_number(s)}
-    return timing_figure(stages) if stages else b""  # no stage was measured
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
 @functools.cache
 def _packed_plotly() -> str:
     """Return plotly.js, compressed: a third of its size, and no URL of it appears in the file."""
     return base64.b64encode(gzip.compress(get_plotlyjs().encode("utf-8"), mtime=0)).decode("ascii")
 
 
-def _embedded(png: bytes) -> dict[str, Any]:
+def embedded(png: bytes) -> dict[str, Any]:
     """Return what is seen in an image, and kinds and URLs of its layers, one upon the other.
 
     Of a figure that is ``ink``, which a dark page makes light, and its ``picture``, if it has one.
     """
-    with Image.open(io.BytesIO(png)) as image:
+    with PIL.Image.open(io.BytesIO(png)) as image:
         layers, boxes = {"picture": image}, json.loads(image.info.get(style.PICTURES, "null"))
         if boxes is not None:
-            mask = Image.new("L", image.size)
+            mask = PIL.Image.new("L", image.size)
             for box in boxes:
                 mask.paste(255, tuple(box))
             layers["picture"].putalpha(mask)
-            ink = Image.composite(Image.new("RGB", image.size, "white"), image.convert("RGB"), mask)
+            ink = PIL.Image.composite(
+                PIL.Image.new("RGB", image.size, "white"), image.convert("RGB"), mask
+            )
             layers = {"ink": ink} | (layers if boxes else {})
         shown = [(kind, _url(one)) for kind, one in layers.items()]
         return {"seen": image.info.get(style.SEEN, ""), "layers": shown}
 
 
-def _url(image: Image.Image) -> str:
+def _url(image: PIL.Image.Image) -> str:
     buffer = io.BytesIO()
     if max(image.size) > _WEBP_MOST_PX:
         image = image.copy()
         image.thumbnail((_WEBP_MOST_PX, _WEBP_MOST_PX))
     image.save(buffer, "WEBP", quality=_WEBP_QUALITY, method=_WEBP_METHOD)
     return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
-
-
-@style.styled
-def timing_figure(stages: Mapping[str, float]) -> bytes:
-    """Draw time and fraction of each stage, in the order of the mapping."""
-    figure, axes = style.subplots(style.HALF_IN, max(1.6, 0.42 * len(stages) + 0.9))
-    seconds = np.asarray(list(stages.values()), dtype=np.float64)
-    total = max(float(seconds.sum()), 1e-12)
-    bars = axes.barh(list(stages), seconds, height=0.62)
-    axes.bar_label(bars, [f"{value:.2f} s · {value / total:.0%}" for value in seconds], padding=4)
-    axes.invert_yaxis()
-    axes.set(xlabel="time (s)", xlim=(0, max(float(seconds.max(initial=0.0)), 1e-12) * 1.28))
-    axes.grid(visible=False, axis="y")
-    longest = sorted(stages.items(), key=lambda stage: -stage[1])[:3]
-    named = ", ".join(f"{name} {spent:.2f} s" for name, spent in longest)
-    return style.to_png(figure, f"Of {total:.2f} s, most in {named}" if named else "")

@@ -1,20 +1,21 @@
-"""The report of a pair, and figures of pairs and of the results for their pixels, as PNG."""
+"""The report of a pair; the section and the figures of a pair and of the results for its pixels."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
-from recon.core.text import counted
+from recon.core.text import counted, metres
 from recon.core.values import (
     Disparity,
     DisparityMetrics,
@@ -25,13 +26,14 @@ from recon.core.values import (
     TriangleMesh,
 )
 from recon.core.values.arrays import Bool, UInt8
-from recon.core.values.camera import depth_from_disparity, disparity_from_depth
+from recon.core.values.camera import depth_from_disparity
 from recon.evaluation.disparity import Kind
 from recon.evaluation.pair_summary import DisparitySummary, PairSummary
 from recon.io.images.image import write_image
 from recon.report import style
-from recon.report.page import write_page
-from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
+from recon.report.page import last_part, run_figures, run_section, write_page
+from recon.report.scene import upright_scene
+from recon.report.sections import Block, Image, Page, Section, Table, View3D, known
 from recon.run.directory import RunDirectory
 from recon.stereo.frame import StereoSettings
 
@@ -63,7 +65,7 @@ class PairResult:
 def write_pair_page(result: PairResult, run: RunDirectory) -> None:
     """Write ``report.html`` of a pair, and its results as colour images."""
     write_disparity_images(result, run)
-    write_page("pair", run, result.summary.to_json(), **pair_content(result))
+    write_page(pair_page(result), run)
 
 
 def write_disparity_images(result: PairResult, run: RunDirectory) -> None:
@@ -77,51 +79,95 @@ def write_disparity_images(result: PairResult, run: RunDirectory) -> None:
         write_image(run.path(f"disparity/{name}_colour.png"), image)
 
 
-def pair_content(result: PairResult) -> Json:
-    """Return what the page of a pair shows: disparity, accuracy and 3-D view."""
-    values, truth, error = result.disparity.values, result.truth, None
-    if truth is not None and truth.values.shape == values.shape:
-        error = error_figure(np.abs(values - truth.values), result.disparity.inferred)
-    depth_m = depth_from_disparity(values, result.pair.camera)
-    known = depth_m[np.isfinite(depth_m)]
-    far = float(np.median(known)) if known.size else 1.0
-    # From behind, left of and above the camera, depth is visible.
-    eye_m = (-0.1 * far, 0.25 * far, 0.25 * far)
-    return {
-        "run": result,
-        "result": stereo_figures(result.pair, result.disparity),
-        "error": error,
-        "limit_px": ERROR_LIMIT_PX,
-        "errors": _error_rows(result),
-        "view": plot_scene(Scene(T_UPRIGHT_CAMERA, result.cloud, result.mesh, eye_m=eye_m)),
-    }
+def pair_page(result: PairResult) -> Page:
+    """Return the page of a pair: disparity, accuracy and 3-D view."""
+    camera, found, disparity = result.pair.camera, result.summary.to_json(), result.disparity
+    baseline = f"baseline {camera.baseline_m:.4g} m"
+    if found.get("up_to_scale"):
+        baseline = "baseline unknown: every m in this report is one baseline"
+    subtitle = (
+        f"{camera.width_px} × {camera.height_px} px, focal length {camera.focal_px:.1f} px "
+        f"({camera.field_of_view_deg:.0f}° wide), {baseline}, doffs {camera.doffs_px:.4g} px"
+    )
+    measured, inferred = (100 * kind.mean() for kind in (disparity.measured, disparity.inferred))
+    coverage = found.get("mesh_coverage")
+    figures = [
+        ("Pixels measured", f"{measured:.1f} %"),
+        ("Pixels inferred", f"{inferred:.1f} %" if inferred else ""),
+        *_error_figures(result),
+        *run_figures(found),
+        ("Points", known("{:,}", found.get("points"))),
+        ("Triangles", known("{:,}", found.get("faces") or None)),
+        ("Points on the mesh", known("{:.1f} %", None if coverage is None else 100 * coverage)),
+    ]
+    network = [(name, str(value)) for name, value in (found.get("network") or {}).items()]
+    stereo = stereo_blocks(result.pair, disparity)
+    sections = [
+        Section("Disparity", [*stereo, Table("Network", ("what", "value"), network)]),
+        Section("Against the truth", _error_blocks(result)),
+        Section("Cloud", [_view(result)]),
+        run_section(found),
+    ]
+    title = f"Stereo pair {last_part(result.name)}"
+    return Page(title, subtitle, figures, sections, found)
 
 
-def _error_rows(result: PairResult) -> list[tuple[str, ...]]:
-    """Return the table of errors, its head first: of all pixels, and of each of two kinds alone."""
-    if result.metrics is None:
+def _error_figures(result: PairResult) -> list[tuple[str, str]]:
+    if (metrics := result.metrics) is None:
         return []
-    shown = {"all": result.metrics} | ({**result.by_kind} if "inferred" in result.by_kind else {})
-    found = [*shown.values()]
-    bad = {f"bad {x:g}: off by more than {x:g} px": x for x in result.metrics.bad}
+    of = ", measured and inferred" if "inferred" in result.by_kind else ""
+    bad = [(f"Bad {x:g}: off by more than {x:g} px{of}", y) for x, y in metrics.bad.items()]
+    mean = f"{metrics.avgerr_px:.2f} px"
+    return [(f"Mean error{of}", mean), *((label, f"{percent:.1f} %") for label, percent in bad)]
+
+
+def _error_blocks(result: PairResult) -> list[Block]:
+    """Return the errors as a picture and a table: of all pixels, and of each of two kinds alone."""
+    if result.truth is None or result.metrics is None:
+        return []
+    values, truth, drawn = result.disparity.values, result.truth.values, None
+    if truth.shape == values.shape:
+        drawn = error_figure(np.abs(values - truth), result.disparity.inferred)
+    both = "inferred" in result.by_kind
+    shown = {"all": result.metrics} | ({**result.by_kind} if both else {})
+    of = [*shown.values()]
+    rows = [
+        *((f"bad {x:g}: off by more than {x:g} px", *(f"{one.bad[x]:.2f} %" for one in of))
+          for x in result.metrics.bad),
+        ("without a value", *(f"{one.invalid:.2f} %" for one in of)),
+        ("mean absolute error", *(f"{one.avgerr_px:.3f} px" for one in of)),
+        ("root mean square error", *(f"{one.rms_px:.3f} px" for one in of)),
+        ("pixels compared", *(f"{one.pixels:,}" for one in of)),
+    ]  # fmt: skip
+    note = (
+        "All: of the pixels whose truth is known, those without a value too, which are not bad. "
+        "Measured and inferred: of such pixels alone."
+    )
     return [
-        ("figure", *shown),
-        *((name, *(f"{one.bad[x]:.2f} %" for one in found)) for name, x in bad.items()),
-        ("without a value", *(f"{one.invalid:.2f} %" for one in found)),
-        ("mean absolute error", *(f"{one.avgerr_px:.3f} px" for one in found)),
-        ("root mean square error", *(f"{one.rms_px:.3f} px" for one in found)),
-        ("pixels compared", *(f"{one.pixels:,}" for one in found)),
+        Image("Disparity error", drawn, ERROR_CAPTION),
+        Table("Disparity against truth", ("figure", *shown), rows, caption=note if both else ""),
     ]
 
 
+def _view(result: PairResult) -> View3D:
+    depth_m = depth_from_disparity(result.disparity.values, result.pair.camera)
+    known_m = depth_m[np.isfinite(depth_m)]
+    far = float(np.median(known_m)) if known_m.size else 1.0
+    # From behind, left of and above the camera, depth is visible.
+    scene = upright_scene(result.cloud, result.mesh, (-0.1 * far, 0.25 * far, 0.25 * far))
+    caption = "Seen from the left camera, turned so that z is up."
+    if count := result.summary.to_json().get("inferred_points"):
+        caption += f" {count:,} of the points are inferred."
+    elif result.disparity.inferred.any():
+        caption += " Of measured pixels alone: --set cloud.inferred=true has those inferred, too."
+    return View3D("In 3-D", scene, caption)
+
+
 ERROR_LIMIT_PX = 4.0  # error of the last colour: the largest threshold of Middlebury's table
+ERROR_CAPTION = f"Blue is right, red is off by {ERROR_LIMIT_PX:g} pixels or more."
 _BELOW_IN = 1.0  # strip below an image: axis label and ticks, colour bar, and depths above it
 _BAR_BOTTOM_IN, _BAR_IN = 0.5, 0.16
 _WIDE_ASPECT = 2.0
-_LABEL_ROOM = 0.1  # fraction of the length of a scale: "0.45 m" below a narrow image
-_FARTHEST_MARK_M = 1000.0
-# Ticks of a depth scale, the roundest first; the others fill the remaining space.
-_DEPTH_STEPS = ((1.0, 2.0, 5.0), (3.0, 4.0, 6.0, 8.0), (1.5, 2.5, 3.5, 4.5, 7.0, 9.0))
 
 
 def is_wide(shape: tuple[int, ...]) -> bool:
@@ -129,19 +175,30 @@ def is_wide(shape: tuple[int, ...]) -> bool:
     return shape[1] >= _WIDE_ASPECT * shape[0]
 
 
-def stereo_figures(pair: Rectified, disparity: Disparity) -> dict[str, Any]:
-    """Draw a pair and the results for its pixels; also return what their captions need."""
+def pair_image(pair: Rectified) -> Image:
+    """Return the rectified images as a block of a page."""
+    caption = "Rectified: a point is on the same row in both images."
+    return Image("Input pair", pair_figure(pair), caption)
+
+
+def stereo_blocks(pair: Rectified, disparity: Disparity) -> list[Block]:
+    """Return a pair and the results for its pixels as blocks of a page."""
     depth_m = depth_from_disparity(disparity.values, pair.camera)
-    return {
-        "pair": pair_figure(pair),
-        "disparity": disparity_figure(disparity, pair.camera),
-        "depth": depth_figure(depth_m, disparity.inferred),
-        "reasons": reasons_figure(disparity),
-        "confidence": confidence_figure(disparity),
-        "valid_percent": float(100 * disparity.measured.mean()),
-        "inferred_percent": float(100 * disparity.inferred.mean()),
-        "wide": is_wide(disparity.values.shape),
-    }
+    seen = f"{100 * disparity.measured.mean():.1f} % of the pixels were measured"
+    if disparity.inferred.any():
+        percent = 100 * disparity.inferred.mean()
+        seen += f", {percent:.1f} % inferred from planes around them (hatched)"
+    return [
+        pair_image(pair),
+        Image("Disparity", disparity_figure(disparity, pair.camera),
+              f"Red is near, blue is far, black is unknown; {seen}."),
+        Image("Depth", depth_figure(depth_m, disparity.inferred),
+              "The same in metres along the optical axis."),
+        Image("Why pixels have no disparity", reasons_figure(disparity),
+              "The first check that each pixel failed, and what fraction of all failed it."),
+        Image("Confidence", confidence_figure(disparity),
+              "Estimated probability that the match is correct; what was inferred is no match."),
+    ]  # fmt: skip
 
 
 @style.styled
@@ -164,7 +221,7 @@ def disparity_figure(disparity: Disparity, camera: RectifiedCamera) -> bytes:
     """Draw the disparity map, with scales in pixels below it and in metres of depth above that."""
     limits = style.value_range(disparity.values)
     figure = _image(style.colour_disparity(disparity.values, limits), disparity.inferred)
-    bar = _colour_bar(figure, style.DISPARITY_SCALE, limits, "disparity in pixels")
+    bar = _colour_bar(figure, style.DISPARITY_SCALE, Normalize(*limits), "disparity in pixels")
     _mark_depths(bar, limits, camera)
     ratios = (100 * kind.mean() for kind in (disparity.measured, disparity.inferred))
     seen = "Disparities: {}; {:.1f} % measured, {:.1f} % inferred"
@@ -182,9 +239,10 @@ def depth_figure(depth_m: NDArray[Any], inferred: Bool | None = None) -> bytes:
     # Reversed, so that near has the same colour as in the disparity map.
     scale = f"{style.DISPARITY_SCALE}_r"
     figure = _image(style.colour_values(np.log(known_m), scale, limits), inferred)
-    bar = _colour_bar(figure, scale, limits, "depth in metres (logarithmic)")
-    depths = depth_marks(low, high, math.log, limits)
-    bar.set_xticks(np.log(depths).tolist(), [f"{depth:g}" for depth in depths])
+    bar = _colour_bar(figure, scale, LogNorm(low, high), "depth in metres (logarithmic)")
+    bar.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    bar.xaxis.set_major_formatter("{x:g}")
+    bar.minorticks_off()
     return style.to_png(figure, f"Depths: {style.spread(known_m, ' m')}")
 
 
@@ -193,7 +251,7 @@ def confidence_figure(disparity: Disparity) -> bytes:
     """Draw the confidence of each match that was measured, from 0 to 1."""
     sure = disparity.only_measured().confidence
     figure = _image(style.colour_confidence(sure))
-    _colour_bar(figure, style.CONFIDENCE_SCALE, (0.0, 1.0), "confidence (dark: not measured)")
+    _colour_bar(figure, style.CONFIDENCE_SCALE, Normalize(0, 1), "confidence (dark: not measured)")
     matched = sure[sure > 0]
     return style.to_png(figure, f"Confidence of the matches: {style.spread(matched)}")
 
@@ -203,7 +261,7 @@ def error_figure(error_px: NDArray[Any], inferred: Bool | None = None) -> bytes:
     """Draw the absolute disparity error of each pixel; NaN = not compared."""
     figure = _image(style.colour_error(error_px, ERROR_LIMIT_PX), inferred)
     label = "absolute disparity error in pixels (dark: not compared)"
-    _colour_bar(figure, style.ERROR_SCALE, (0.0, ERROR_LIMIT_PX), label, extend="max")
+    _colour_bar(figure, style.ERROR_SCALE, Normalize(0, ERROR_LIMIT_PX), label, extend="max")
     return style.to_png(figure, f"Disparity errors: {style.spread(error_px, ' px')}")
 
 
@@ -218,27 +276,6 @@ def reasons_figure(disparity: Disparity) -> bytes:
     middle = 0.5 * _BELOW_IN / figure.get_size_inches()[1]
     figure.legend(handles=handles, loc="center", ncols=columns, bbox_to_anchor=(0.5, middle))
     return style.to_png(figure, f"Of all pixels: {', '.join(labels)}")
-
-
-def depth_marks(
-    low_m: float, high_m: float, place: Callable[[float], float], limits: tuple[float, float]
-) -> list[float]:
-    """Return depths > 0 to mark on a scale with these ends, as many as its labels have room for."""
-    powers = range(math.floor(math.log10(low_m)), math.ceil(math.log10(high_m)) + 1)
-    choices = [step * 10.0**power for tier in _DEPTH_STEPS for power in powers for step in tier]
-    if low_m < high_m < 2.0 * low_m:  # hardly any of these lies in between
-        whole_m = 10.0 ** math.floor(math.log10(high_m - low_m))
-        for step_m in (whole_m, 0.5 * whole_m, 0.2 * whole_m):
-            steps = range(math.ceil(low_m / step_m), int(high_m / step_m) + 1)
-            choices += [step_m * n for n in steps]
-    room = _LABEL_ROOM * (limits[1] - limits[0])
-    marks: dict[float, float] = {}
-    for depth in choices:
-        there = place(depth)
-        free = all(abs(there - other) >= room for other in marks.values())
-        if low_m <= depth <= high_m and free:
-            marks[depth] = there
-    return sorted(marks)
 
 
 def _image(image: UInt8, inferred: Bool | None = None) -> Figure:
@@ -260,29 +297,23 @@ def _image(image: UInt8, inferred: Bool | None = None) -> Figure:
 
 
 def _colour_bar(
-    figure: Figure, scale: str, limits: tuple[float, float], label: str, extend: str = "neither"
+    figure: Figure, scale: str, norm: Normalize, label: str, extend: str = "neither"
 ) -> Axes:
     height_in = figure.get_size_inches()[1]
     axes = figure.add_axes((0.05, _BAR_BOTTOM_IN / height_in, 0.9, _BAR_IN / height_in))
-    colours = ScalarMappable(Normalize(*limits), cmap=scale)
+    colours = ScalarMappable(norm, cmap=scale)
     bar = figure.colorbar(colours, cax=axes, orientation="horizontal", extend=extend, label=label)
     bar.outline.set_visible(False)
     return axes
 
 
 def _mark_depths(bar: Axes, limits: tuple[float, float], camera: RectifiedCamera) -> None:
-    """Mark round depths on the upper side of a horizontal disparity bar."""
-    near, far = depth_from_disparity(np.asarray([limits[1], limits[0]]), camera).tolist()
-    if not math.isfinite(near):
-        return
-    # A disparity near 0 is an unbounded depth.
-    far = min(far, _FARTHEST_MARK_M) if math.isfinite(far) else _FARTHEST_MARK_M
-
-    def place(depth_m: float) -> float:
-        return float(disparity_from_depth(np.asarray(depth_m), camera))
-
-    depths, upper = depth_marks(near, far, place, limits), bar.twiny()
+    """Say above a bar of disparities how far away they are."""
+    places = [place for place in bar.get_xticks() if limits[0] <= place <= limits[1]]
+    depths_m = depth_from_disparity(np.asarray(places), camera).tolist()
+    labels = [metres(depth_m) if math.isfinite(depth_m) else "" for depth_m in depths_m]
+    upper = bar.twiny()
     upper.set_xlim(*limits)
     upper.spines[:].set_visible(False)
-    upper.set_xticks([*map(place, depths)], [f"{depth:g} m" for depth in depths])
+    upper.set_xticks(places, labels)
     upper.tick_params(length=2, pad=1)

@@ -14,12 +14,13 @@ from recon.core.values.arrays import Float32
 from recon.core.values.camera import depth_from_disparity
 from recon.evaluation import paper
 from recon.report import pair_page, style
-from recon.report.page import write_page
-from recon.report.scene import T_UPRIGHT_CAMERA, Json, Scene, plot_scene
+from recon.report.page import run_section, write_page
+from recon.report.scene import upright_scene
+from recon.report.sections import Block, Image, Page, Section, Table, View3D, at, known, row_of
 from recon.run.directory import RunDirectory
 
 _MAX_POINTS: Final = 20_000
-_NEAR_RATIO: Final = 0.9  # as the caption says
+_NEAR_FRACTION: Final = 0.9
 # Dashed, as both printed methods give a value to the same pixels.
 _LINES: Final = {
     paper.CORRECTED: (style.ESTIMATE, "-"),
@@ -37,49 +38,137 @@ def write_paper_page(
     run: RunDirectory,
 ) -> None:
     """Write ``report.html`` of the seed paper's experiments on the scenes of a folder."""
-    write_page(
-        "paper",
-        run,
-        summary,
-        folder=folder.name or folder,
-        titles=paper.TITLES,
-        drawn=[
-            {
-                "experiment": one,
-                "pair": pair_page.pair_figure(methods[0].pair),
-                "methods": {each.method: _draw_method(one, each) for each in methods},
-                "patches": patches_figure(summary["experiments"][str(one.number)]["patches"]),
-                "curve": depth_curve_figure(one.camera, methods[0].disparity.values),
-            }
-            for one, methods in results
-        ],
-        limit_px=pair_page.ERROR_LIMIT_PX,
-        bad_px=paper.BAD_PX,
+    experiments = summary["experiments"]
+    figures = [
+        (
+            f"{found['scene']}: median depth error, {paper.TITLES[method]}",
+            known("{:.2f} %", at(found["methods"][method], "depth", "median_error_percent")),
+        )
+        for found in experiments.values()
+        # With the corrected method, and with the last.
+        for method in (paper.CORRECTED, [*found["methods"]][-1])
+    ]
+    sections = [
+        Section("Table 1", [_table_1(summary["table_1"])]),
+        *(_experiment(one, methods, experiments[str(one.number)]) for one, methods in results),
         # Experiments have their own sections.
-        of_the_run={k: v for k, v in summary.items() if k not in {"experiments", "table_1"}},
+        run_section({k: v for k, v in summary.items() if k not in {"experiments", "table_1"}}),
+    ]
+    both = "the method as printed beside the corrected one"
+    ways = both if summary["as_printed"] else "the corrected method"
+    subtitle = f"Middlebury scenes of {folder.name or folder}; {ways}"
+    title = "Experiments 2 to 4 of the paper"
+    write_page(Page(title, subtitle, figures, sections, summary), run)
+
+
+def _table_1(rows: Sequence[Mapping[str, Any]]) -> Table:
+    head = (
+        "", "focal length, as printed", "baseline", "disparities", "true focal length", "doffs",
+        "depth error of the printed row",
+    )  # fmt: skip
+    columns = (
+        ("{:.7g}", "printed", "focal_length"),
+        ("{:.7g} mm", "printed", "baseline_mm"),
+        ("{:d}", "printed", "ndisp"),
+        ("{:.7g} px", "corrected", "focal_px"),
+        ("{:.7g} px", "corrected", "doffs_px"),
+        ("{:.1f} %", "depth_error_of_printed_percent"),
     )
+    shown = [row_of(f"{row['experiment']} {row['scene']}", row, columns) for row in rows]
+    caption = (
+        "Read from the scenes' calib.txt. The printed column of focal lengths is doffs, the "
+        "difference of the principal points. The last column is the median error that the printed "
+        "row alone makes: with the true disparities."
+    )
+    return Table("As printed, and corrected", head, shown, caption=caption)
 
 
-def _draw_method(one: paper.Experiment, result: paper.MethodResult) -> dict[str, Any]:
-    """Draw disparity, depth, error and surface of one method."""
-    values, truth = result.disparity.values, one.truth
-    return {
-        "wide": pair_page.is_wide(values.shape),
-        "disparity": pair_page.disparity_figure(result.disparity, result.pair.camera),
-        "depth": pair_page.depth_figure(result.depth_m),
-        "surface": surface_figure(result.disparity),
-        "error": None if truth is None else pair_page.error_figure(np.abs(values - truth.values)),
+def _experiment(
+    one: paper.Experiment, methods: Sequence[paper.MethodResult], found: Mapping[str, Any]
+) -> Section:
+    """Return an experiment: pair, methods beside each other, effect of the patch size, clouds."""
+    camera = one.camera
+    intro = (
+        f"{camera.width_px} × {camera.height_px} px, focal length {camera.focal_px:.7g} px, "
+        f"baseline {1000 * camera.baseline_m:.7g} mm, doffs {camera.doffs_px:.7g} px"
+    )
+    patches, values = found["patches"], methods[0].disparity.values
+    blocks: list[Block] = [
+        pair_page.pair_image(methods[0].pair),
+        _method_table(found["methods"]),
+        *(image for each in methods for image in _method_images(one, each)),
+        Image("The effect of the patch size", patches_figure(patches),
+              "Against the truth, at pixels seen by both cameras; the last panel counts all "
+              "pixels. Percentages are of all compared pixels, with or without a value. "
+              "Corrected: the matcher sad with a window of that size and its checks, which reject "
+              "doubtful pixels."),
+        Image("Depth against disparity", depth_curve_figure(camera, values),
+              "Fig. 24-26's kind of curve. With doffs for the focal length, and none added to d, "
+              "both scale and shape are wrong."),
+        *(_patch_table(method, tried) for method, tried in patches.items()),
         # The cloud of the method as printed is not worth turning.
-        "view": None if result.method == paper.AS_PRINTED else _view(result),
+        *(_view(each) for each in methods if each.method != paper.AS_PRINTED),
+    ]  # fmt: skip
+    return Section(f"Experiment {one.number}: {found['scene']}", blocks, intro)
+
+
+def _method_table(methods: Mapping[str, Any]) -> Table:
+    head = (
+        "method", "pixels with a value", "off by more than 1 px", "mean error", "median depth",
+        "true median depth", "median depth error",
+    )  # fmt: skip
+    columns = (
+        ("{:.1f} %", "valid_percent"),
+        ("{:.1f} %", "disparity", "bad", "1.0"),
+        ("{:.2f} px", "disparity", "avgerr_px"),
+        ("{:.3f} m", "depth", "median_m"),
+        ("{:.3f} m", "depth", "true_median_m"),
+        ("{:.2f} %", "depth", "median_error_percent"),
+    )
+    rows = [row_of(paper.TITLES[method], one, columns) for method, one in methods.items()]
+    caption = (
+        "Against the truth at pixels seen by both cameras; errors are those of the pixels where a "
+        "method has a value. Limits in pixels of this size."
+    )
+    return Table("The methods side by side", head, rows, caption=caption)
+
+
+def _patch_table(method: str, tried: Sequence[Mapping[str, Any]]) -> Table:
+    columns = {
+        "with a value": ("{:.1f} %", "valid_percent"),
+        f"right within {paper.BAD_PX:g} px": ("{:.1f} %", "right_percent"),
+        "wrong": ("{:.1f} %", "bad_percent"),
+        "mean error": ("{:.2f} px", "avgerr_px"),
     }
+    rows = [row_of(f"{one['patch_px']} px", one, columns.values()) for one in tried]
+    return Table(f"Patches, {paper.TITLES[method]}", ("patch", *columns), rows)
 
 
-def _view(result: paper.MethodResult) -> Json | None:
-    cloud = result.cloud
+def _method_images(one: paper.Experiment, result: paper.MethodResult) -> list[Image]:
+    """Return disparity, depth, surface and error of one method."""
+    values, truth, title = result.disparity.values, one.truth, paper.TITLES[result.method]
+    error = None if truth is None else pair_page.error_figure(np.abs(values - truth.values))
+    return [
+        Image(f"Disparity map, {title}",
+              pair_page.disparity_figure(result.disparity, result.pair.camera),
+              "Red is near, black is unknown."),
+        Image(f"Depth map, {title}", pair_page.depth_figure(result.depth_m),
+              "Metres along the optical axis."),
+        Image(f"Disparity as a surface, {title}", surface_figure(result.disparity),
+              "Fig. 6's kind of view: the image lies flat, the disparity is its height."),
+        Image(f"Disparity error, {title}", error, pair_page.ERROR_CAPTION),
+    ]  # fmt: skip
+
+
+def _view(result: paper.MethodResult) -> View3D:
+    cloud, caption = result.cloud, "Turned so that z is up."
+    if result.method != paper.CORRECTED:
+        caption += f" The farthest {1 - _NEAR_FRACTION:.0%} of the points are left out here."
     if len(cloud) and result.method != paper.CORRECTED:
         # Integer disparities near 0 give layers far behind everything, which would shrink the rest.
-        cloud = cloud.select(cloud.xyz[:, 2] <= np.quantile(cloud.xyz[:, 2], _NEAR_RATIO))
-    return plot_scene(Scene(T_UPRIGHT_CAMERA, cloud), _MAX_POINTS)
+        cloud = cloud.select(cloud.xyz[:, 2] <= np.quantile(cloud.xyz[:, 2], _NEAR_FRACTION))
+    title = f"Point cloud, {paper.TITLES[result.method]}"
+    return View3D(title, upright_scene(cloud), caption, _MAX_POINTS)
 
 
 @style.styled
@@ -122,9 +211,9 @@ def depth_curve_figure(camera: RectifiedCamera, disparities_px: Float32) -> byte
         believed = paper.camera_of_table_1(camera)
         look["label"] = f"as printed: Z = f·b / d, f = {believed.focal_px:.7g} px"
         axes.plot(d, depth_from_disparity(d, believed), color=style.BAD, **look)
-    known = disparities_px[np.isfinite(disparities_px)]
-    if known.size:
-        low, high = np.percentile(known, (1.0, 99.0))
+    found_px = disparities_px[np.isfinite(disparities_px)]
+    if found_px.size:
+        low, high = np.percentile(found_px, (1.0, 99.0))
         look = {"color": style.FAINT, "alpha": 0.13, "linewidth": 0}
         axes.axvspan(low, high, label="disparities found", **look)
     axes.set(yscale="log", xlabel="disparity d (px)", ylabel="depth Z (m, logarithmic)")

@@ -1,18 +1,19 @@
-"""What pages of drives show of the refined rig: the field of its correction, and its parameters."""
+"""The section of the refined rig in pages of drives: its parameters, and what they correct."""
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Mapping
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
+from recon.core.text import counted
 from recon.look.fault import LENS, LENS_SIGMA_PX
 from recon.look.rig import RefinedRig, RigChange
 from recon.report import style
-from recon.report.scene import Json
-from recon.report.table import NOT_KNOWN
+from recon.report.sections import NOT_KNOWN, Image, Section, Table
 
 _LEAST_PX: Final = 0.1  # of the scale of the field: a rig that is as calibrated has faint colours
 _TURN: Final = {
@@ -23,21 +24,28 @@ _KNOWN: Final = ("value", "sigma")
 _COLOURS: Final = 24  # an even number, so that 0 lies between two of them
 
 
-def rig_content(rig: RefinedRig | None) -> Json | None:
-    """Return the field and the tables of a rig; None if it was not fitted."""
+def rig_section(rig: RefinedRig | None) -> Section:
+    """Return what the motion shows of the rig; a section of nothing if it was not fitted."""
     if rig is None or rig.fitted is None:
-        return None
-    found = rig.figures().to_json()
-    return {
-        "refined": rig.refined,
-        "depth_m": rig.changes[-1].depth_m,
-        "windows": found["windows"],
-        "field": field_figure(rig.changes[-1], (rig.camera.width_px, rig.camera.height_px)),
-        "off": _off_rows(found),
-        "turn": _turn_rows(found["parameters"]),
-        "lenses": _lens_rows(found["parameters"]),
-        "lens_px": LENS_SIGMA_PX,
-    }
+        return Section("Rig", [])
+    found, depth_m = rig.figures().to_json(), rig.changes[-1].depth_m
+    field = field_figure(rig.changes[-1], (rig.camera.width_px, rig.camera.height_px))
+    used = "The motion shows another rig than the calibration gives: recon map uses it."
+    return Section("Rig", [
+        Image("What the calibration does to disparities", field,
+              f"Of what is {depth_m:g} m away: red was seen too near, blue too far."),
+        Table("With the rig as given", ("figure", "off by", "sigma"), _off_rows(found), caption=(
+            f"By the motion of {counted(found['windows'], 'window')} of frames. Depth: positive "
+            "seems farther than it is. What no motion shows is the baseline.")),
+        Table("Right camera", ("parameter", "value", "sigma", "prior"),
+              _turn_rows(found["parameters"]), caption=(
+            "Its rotation, and the change of its focal length. The prior is the standard "
+            "deviation that is expected beforehand.")),
+        Table("Lenses", ("term", "left (px)", "right (px)"),
+              _lens_rows(found["parameters"]), caption=(
+            "What each term of OpenCV's model moves in the corners of the image, with its "
+            f"standard deviation; the prior of each is {LENS_SIGMA_PX:g} px.")),
+    ], used if rig.refined else "recon map uses the rig as calibrated.")  # fmt: skip
 
 
 @style.styled
@@ -60,13 +68,19 @@ def field_figure(change: RigChange, size_px: tuple[int, int]) -> bytes:
     return style.to_png(figure, f"Disparities are off by {style.spread(change.off_px, ' px')}")
 
 
-def _off_rows(found: Json) -> list[tuple[str, str, str]]:
+def _off_rows(found: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Return what was wrong with what the rig given saw: figure, value, standard deviation."""
     off, time = found["disparity_px"], found["right_time_offset"]
     late = (
         []
         if time["sigma"] is None
-        else [("right images, later", f"{time['frames']:+.2f} frames", f"{time['sigma']:.2f}")]
+        else [
+            (
+                "time offset of the right images",
+                f"{time['frames']:+.2f} frames",
+                f"{time['sigma']:.2f}",
+            )
+        ]
     )
     depths = (
         (f"depth at {depth} m", f"{of['mean']:+.1f} %", f"{of['sigma']:.1f} %")
@@ -83,7 +97,7 @@ def _off_rows(found: Json) -> list[tuple[str, str, str]]:
     ]
 
 
-def _turn_rows(parameters: Json) -> list[tuple[str, ...]]:
+def _turn_rows(parameters: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return how the right camera differs: parameter, value, standard deviation, prior."""
     rows = []
     for name, (label, unit, scale) in _TURN.items():
@@ -93,7 +107,7 @@ def _turn_rows(parameters: Json) -> list[tuple[str, ...]]:
     return rows
 
 
-def _lens_rows(parameters: Json) -> list[tuple[str, ...]]:
+def _lens_rows(parameters: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return what each term of both lenses moves at the corners, in px; [] if they were held."""
     rows = []
     for term in LENS:

@@ -1,223 +1,164 @@
-"""A cloud, a mesh and paths in 3-D, as plain data for plotly.js, thinned for display.
-
-The colour of a point is its index in a palette: ``rgb()`` strings would be ten times the size.
-"""
+"""What is shown in 3-D of a pair or a map, as values that reports and the viewer draw."""
 
 from __future__ import annotations
 
-import itertools
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
-from plotly import graph_objects as go
-from plotly.colors import get_colorscale
 
-from recon.core.geometry.se3 import apply
-from recon.core.text import counted
-from recon.core.values import PointCloud, TriangleMesh
-from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.report import style
+from recon.core.geometry.se3 import apply, transform_cloud
+from recon.core.values import ATTRIBUTES, OccupancyGrid, PointCloud, TriangleMesh
+from recon.core.values.arrays import Bool, Float64, UInt8
 
-MAX_POINTS: Final = 120_000
-MAX_FACES: Final = 80_000
 # From camera axes (x right, y down, z forward) to x forward and z up.
 T_UPRIGHT_CAMERA: Final[Float64] = np.array(
     [[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
-_TITLES: Final = {"x": "x forward (m)", "y": "y left (m)", "z": "z up (m)"}
-_AXIS: Final = {
-    "color": "#aab4be", "gridcolor": "#2c343c", "zeroline": False, "showbackground": False,
-}  # fmt: skip
-_LAYOUT: Final = {
-    "template": "none",
-    "paper_bgcolor": "#14181d",
-    "font_color": "#dfe5ea",
-    "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-    "legend": {
-        "x": 0.0, "y": 0.0, "yanchor": "bottom", "itemsizing": "constant",
-        "bgcolor": "rgba(20,24,29,0.8)",
-    },
-    "uirevision": "kept",  # changing the colouring does not reset the view
-    "scene_aspectmode": "manual",
-}  # fmt: skip
-# By its colours, as plotly.js does not know the name.
-_TURBO: Final = get_colorscale("Turbo")
-_PATH_COLOURS: Final = ("#ff5252", "#ffb74d", "#81c784")
-_OUTLIER_RATIO: Final = 0.002
+_SHOWN: Final = {each.view: each for each in ATTRIBUTES if each.view}
+COLOURINGS: Final = ("image", "height", *(by for by in _SHOWN if by != "image"))
+_SCALES: Final = {"turbo": "blue to red", "viridis": "blue to yellow"}  # others have no legend
+_OUTLIER_FRACTION: Final = 0.002
 # Candidate viewpoints: from behind (x is forward), from the sides, and from above.
 _TURNS_RAD: Final = np.radians(np.arange(-75.0, 76.0, 15.0))
 _ABOVE_RAD: Final = np.radians((25.0, 35.0, 50.0))
-# Tangents across and up: plotly's 45 degrees, with a margin.
-_HALF_VIEW: Final = np.array([0.62, 0.36])
 _CELLS: Final = np.array([48, 28])  # of the view, to count how much of it is filled
 _TRIED_POINTS: Final = 4000
 _CENTRED: Final = 4  # rounds of moving the look-at point to the middle of what is seen
-_FARTHEST_EYE: Final = 2.2  # in units of plotly: a cube of edge 2 then fills most of the view
-# Nearer than the centre, as near objects fill more of the view.
-_LOOK_AT: Final = np.full(3, -0.1)
-Json = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points that belong together: a tile of a map, a submap, or where a camera was along a path.
+
+    ``time_s`` and ``session`` of the ``cloud`` of a map are of the drive that came nearest.
+    """
+
+    name: str
+    cloud: PointCloud
+
+    def values(self, by: str) -> NDArray[Any] | None:
+        """Return what a colouring shows: (N,), or colours (N, 3) by ``image``; None = unknown."""
+        if by in _SHOWN:
+            return self.cloud.arrays.get(_SHOWN[by].name)
+        return self.cloud.xyz[:, 2]
+
+
+class Keyframes(Protocol):
+    """The keyframes of a map, and what they saw."""
+
+    @property
+    def T_map_camera(self) -> Sequence[Float64]: ...
+
+    def sees(self, number: int, place_m: Float64) -> bool:
+        """Return whether a keyframe has a place (3,) in view, with nothing before it."""
+        ...
+
+    def look(self, number: int) -> tuple[list[str], UInt8 | None]:
+        """Return what is said of a keyframe, and a picture of it, uint8 (H, W, 3), or None."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The content of a 3-D view, all in one frame."""
+    """What is shown in 3-D, all in one frame, whose x is forward and whose z is up.
 
-    T_view_frame: Float64  # turns it to x forward, z up
-    cloud: PointCloud | None = None
-    mesh: TriangleMesh | None = None
-    paths: Sequence[tuple[str, Float64]] = ()  # names and positions (N, 3) of cameras
-    eye_m: tuple[float, float, float] | None = None  # in view axes; None = where all is in view
-
-
-def plot_scene(scene: Scene, max_points: int = MAX_POINTS) -> Json | None:
-    """Return the ``data`` and ``layout`` that plotly.js draws; None without point and triangle.
-
-    ``layout.meta`` lists the colourings of the cloud, the first trace: ``label``, and its
-    ``marker``.
+    Attributes:
+        points: Parts of a cloud.
+        mesh: Its surface.
+        paths: Where cameras were, in order; ``rgb``: if a pose is trusted, or which path it is.
+        grids: Occupancy seen from above, each with its height; reports have figures of them.
+        keyframes: Of the viewer, which asks them.
+        lines: What the viewer says of the run.
+        spacing_m: Between points.
+        eye_m: From where it is seen at first; None = from where all is in view.
     """
-    T = scene.T_view_frame
-    cloud = None if scene.cloud is None else _without_outliers(scene.cloud)
-    figure = go.Figure(layout=_LAYOUT)
-    if cloud is not None and len(cloud):
-        thinned = thin_cloud(cloud, max_points)
-        colourings = _colourings(thinned, apply(T, thinned.xyz))
-        figure.add_trace(_cloud_trace(thinned, len(cloud), T, colourings[0]["marker"]))
-        figure.layout.meta = colourings
-    if scene.mesh is not None and len(scene.mesh.faces):
-        thin, hidden = thin_mesh(scene.mesh, MAX_FACES), bool(figure.data)
-        figure.add_trace(_mesh_trace(thin, T, hidden=hidden))
-    if not figure.data:
-        return None
-    for (name, path), colour in zip(scene.paths, itertools.cycle(_PATH_COLOURS), strict=False):
-        look: Json = {"mode": "lines", "line": {"color": colour, "width": 6}}
-        look["hovertemplate"] = "frame %{pointNumber}<br>x %{x:.5r} y %{y:.5r} z %{z:.5r} m"
-        figure.add_trace(go.Scatter3d(name=name, **look, **_xyz(apply(T, path))))
-    _set_view(figure, scene, _visible_points(cloud, scene))
-    return dict(json.loads(figure.to_json()))
+
+    points: tuple[Points, ...] = ()
+    mesh: TriangleMesh | None = None
+    paths: tuple[Points, ...] = ()
+    grids: tuple[tuple[OccupancyGrid, float], ...] = ()
+    keyframes: Keyframes | None = None
+    lines: Sequence[str] = ()
+    spacing_m: float = 0.1
+    eye_m: tuple[float, float, float] | None = None
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is neither a point nor a triangle."""
+        points = any(len(part.cloud) for part in self.points)
+        return not points and (self.mesh is None or not len(self.mesh.faces))
 
 
-def quantise_colours(rgb: UInt8) -> tuple[UInt8, UInt8]:
-    """Return a palette of colours (N, 3): uint8 (P, 3), P <= 256, and uint8 (N,) indices in it."""
-    if not len(rgb):
-        return np.zeros((1, 3), dtype=np.uint8), np.zeros(0, dtype=np.uint8)
-    image = Image.fromarray(rgb[None]).quantize(256, Image.Quantize.MEDIANCUT)
-    palette = np.array(image.getpalette(), dtype=np.uint8).reshape(-1, 3)
-    return palette, np.asarray(image)[0]
+def upright_scene(
+    cloud: PointCloud | None,
+    mesh: TriangleMesh | None = None,
+    eye_m: tuple[float, float, float] | None = None,
+) -> Scene:
+    """Return the scene of what is in the axes of a camera; ``eye_m`` is in those of the scene."""
+    points: tuple[Points, ...] = ()
+    if cloud is not None:
+        points = (Points("cloud", transform_cloud(cloud, T_UPRIGHT_CAMERA, frame="map")),)
+    if mesh is not None:
+        vertices = apply(T_UPRIGHT_CAMERA, mesh.vertices).astype(np.float32)
+        mesh = TriangleMesh(vertices, mesh.faces, rgb=mesh.rgb)
+    return Scene(points, mesh, eye_m=eye_m)
 
 
-def _cloud_trace(thinned: PointCloud, points: int, T: Float64, marker: Json) -> go.Scatter3d:
-    return go.Scatter3d(
-        mode="markers",
-        name=f"cloud ({len(thinned):,} of {counted(points, 'point', form=',')})",
-        hoverinfo="skip",
-        marker={"size": 1.6, "showscale": False, **marker},
-        **_xyz(apply(T, thinned.xyz)),
-    )
+def known_colourings(parts: Sequence[Points]) -> list[str]:
+    """Return by what points can be coloured, which all parts know."""
+    return [by for by in COLOURINGS if all(part.values(by) is not None for part in parts)]
 
 
-def _mesh_trace(mesh: TriangleMesh, T: Float64, *, hidden: bool) -> go.Mesh3d:
-    colouring: Json = {"color": "#b8c4ce"}
-    if mesh.rgb is not None:
-        # One colour per face, as palette indices cannot be interpolated.
-        colouring = _palette_scale(np.rint(mesh.rgb[mesh.faces].mean(axis=1)).astype(np.uint8))
-        colouring |= {"intensity": colouring.pop("color"), "intensitymode": "cell"}
-    return go.Mesh3d(
-        name=f"mesh ({counted(len(mesh.faces), 'triangle', form=',')})",
-        hoverinfo="skip",
-        showlegend=True,
-        showscale=False,
-        visible="legendonly" if hidden else True,
-        lighting={"ambient": 0.65, "diffuse": 0.5, "specular": 0.05},
-        **_xyz(apply(T, mesh.vertices)),
-        **dict(zip("ijk", mesh.faces.T, strict=True)),
-        **colouring,
-    )
+def colours(parts: Sequence[Points], by: str) -> tuple[list[UInt8], str]:
+    """Return uint8 (N, 3) of each part, which all know what they are coloured by, and a legend."""
+    values = [found for part in parts if (found := part.values(by)) is not None]
+    scale, unit = (_SHOWN[by].scale, _SHOWN[by].unit) if by in _SHOWN else ("turbo", "m")
+    if not (scale and values):
+        return values, ""
+    from recon.report.style import colour_values, value_range  # noqa: PLC0415 - takes a second
+
+    if scale not in _SCALES:
+        return [colour_values(each % 10, scale, (0.0, 9.0)) for each in values], ""
+    ends = value_range(np.concatenate(values))
+    legend = f"{ends[0]:.3g} to {ends[1]:.3g} {unit}, {_SCALES[scale]}"
+    return [colour_values(each, scale, ends) for each in values], legend
 
 
-def _xyz(points: NDArray[Any]) -> Json:
-    return dict(zip("xyz", points.astype(np.float32).T, strict=True))
-
-
-def _colourings(cloud: PointCloud, xyz: Float32) -> list[Json]:
-    low, high = style.value_range(xyz[:, 2])
-    height = np.clip((xyz[:, 2] - low) / (high - low) * 255.0, 0, 255).astype(np.uint8)
-    scale = {"color": height, "colorscale": _TURBO, "cmin": 0, "cmax": 255}
-    by_image = [] if cloud.rgb is None else [("image", _palette_scale(cloud.rgb))]
-    return [{"label": by, "marker": marker} for by, marker in (*by_image, ("height", scale))]
-
-
-def _palette_scale(rgb: UInt8) -> Json:
-    """Return a scale with one colour per palette entry, and the index of each point in it."""
-    palette, index = quantise_colours(rgb)
-    colours = palette if len(palette) > 1 else np.repeat(palette, 2, axis=0)
-    last = len(colours) - 1
-    scale = [[n / last, f"rgb({r},{g},{b})"] for n, (r, g, b) in enumerate(colours.tolist())]
-    return {"color": index, "colorscale": scale, "cmin": 0, "cmax": last}
-
-
-def _without_outliers(cloud: PointCloud) -> PointCloud:
-    """Drop the few points far from all others, which would shrink the rest."""
-    if not len(cloud):
-        return cloud
-    low, high = np.quantile(cloud.xyz, (_OUTLIER_RATIO, 1.0 - _OUTLIER_RATIO), axis=0)
+def near_others(xyz: NDArray[Any]) -> Bool:
+    """Return (N,): False for the few points far from all others, which would shrink the rest."""
+    if not len(xyz):
+        return np.zeros(0, np.bool_)
+    low, high = np.quantile(xyz, (_OUTLIER_FRACTION, 1.0 - _OUTLIER_FRACTION), axis=0)
     room = 0.1 * (high - low)
-    inside = ((cloud.xyz >= low - room) & (cloud.xyz <= high + room)).all(axis=1)
-    return cloud.select(inside)
+    return np.asarray(((xyz >= low - room) & (xyz <= high + room)).all(axis=1))
 
 
-def _visible_points(cloud: PointCloud | None, scene: Scene) -> Float64:
-    """Return float64 (N, 3): the initially visible points, view axes."""
-    points: list[NDArray[Any]] = [np.zeros((0, 3)), *(path for _, path in scene.paths)]
-    if cloud is not None and len(cloud):
-        points.append(cloud.xyz)
-    elif scene.mesh is not None:
-        points.append(scene.mesh.vertices)
-    return np.asarray(apply(scene.T_view_frame, np.concatenate(points)))
+def first_view(xyz: NDArray[Any], half_view: tuple[float, float]) -> tuple[Float64, Float64]:
+    """Return eye and look-at point (3,) from which all points (N, 3) are in view, and fill it.
 
-
-def _set_view(figure: go.Figure, scene: Scene, seen: Float64) -> None:
-    box = _bounding_box(seen)
-    # Units of plotly.js: the longest side of the box gets 2 of them.
-    unit = 2.0 / float(np.ptp(box, axis=0).max())
-    if scene.eye_m is None:
-        eye, look_at = _whole_view((seen - box.mean(axis=0)) * unit)
-    else:
-        eye, look_at = (np.asarray(scene.eye_m) - box.mean(axis=0)) * unit, _LOOK_AT
-        # Seen from the position of a long lens, everything would be small in this wider view.
-        eye *= min(1.0, _FARTHEST_EYE / max(float(np.linalg.norm(eye)), 1e-9))
-    sides = unit * np.ptp(box, axis=0)
-    aspect, *view = (dict(zip("xyz", x.tolist(), strict=True)) for x in (sides, eye, look_at))
-    camera = dict(zip(("eye", "center"), view, strict=True))
-    figure.update_layout(scene_aspectratio=aspect, scene_camera=camera)
-    for n, (axis, title) in enumerate(_TITLES.items()):
-        axes = {"title_text": title, "range": box[:, n].tolist(), **_AXIS}
-        figure.layout.scene[f"{axis}axis"].update(axes)
-
-
-def _bounding_box(seen: Float64) -> Float64:
-    """Return float64 (2, 3): bounds of points, with a small margin."""
-    if not len(seen):
-        return np.array([[-1.0] * 3, [1.0] * 3])
-    middle, half = (seen.max(axis=0) + seen.min(axis=0)) / 2, np.ptp(seen, axis=0) / 2
-    half = np.maximum(half, max(float(half.max()) * 0.02, 0.01))  # nothing is entirely flat
-    return np.stack([middle - 1.02 * half, middle + 1.02 * half])
-
-
-def _whole_view(seen: Float64) -> tuple[Float64, Float64]:
-    """Return viewpoint and look-at point from which all points (N, 3) fill the view."""
-    points = seen[:: max(1, len(seen) // _TRIED_POINTS)] if len(seen) else np.zeros((1, 3))
-    tried = [_view_from(points, turn, above) for turn in _TURNS_RAD for above in _ABOVE_RAD]
+    ``half_view``: tangents of half of the view, across and up.
+    """
+    if not len(xyz):
+        return np.array([-1.0, 0.0, 0.5]), np.zeros(3)
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    middle, scale = (low + high) / 2.0, max(float((high - low).max()) / 2.0, 0.01)
+    some = (xyz[:: max(1, len(xyz) // _TRIED_POINTS)] - middle) / scale
+    tried = [
+        _view_from(some, turn, above, np.array(half_view))
+        for turn in _TURNS_RAD
+        for above in _ABOVE_RAD
+    ]
     _, eye, look_at = max(tried, key=lambda view: view[0])
-    return eye, look_at
+    return middle + scale * eye, middle + scale * look_at
 
 
-def _view_from(points: Float64, turn_rad: float, above_rad: float) -> tuple[int, Float64, Float64]:
+def _view_from(
+    points: Float64, turn_rad: float, above_rad: float, half_view: Float64
+) -> tuple[int, Float64, Float64]:
     """Return the nearest view of all points from one direction: filled cells, eye, look-at."""
     level = -np.array([np.cos(turn_rad), np.sin(turn_rad), 0.0])
     towards = np.cos(above_rad) * level + [0.0, 0.0, np.sin(above_rad)]
@@ -227,10 +168,10 @@ def _view_from(points: Float64, turn_rad: float, above_rad: float) -> tuple[int,
     for _ in range(_CENTRED):
         flat, near = (points - look_at) @ axes.T, (points - look_at) @ towards
         # A point at distance z before the eye is in view up to z times the tangent of half of it.
-        away = max(float((np.abs(flat) / _HALF_VIEW + near[:, None]).max()), 0.1)
+        away = max(float((np.abs(flat) / half_view + near[:, None]).max()), 0.1)
         place = flat / (away - near)[:, None]
         look_at = look_at + away * (place.max(axis=0) + place.min(axis=0)) / 2 @ axes
-    cells = np.floor((place / _HALF_VIEW + 1) / 2 * _CELLS)
+    cells = np.floor((place / half_view + 1) / 2 * _CELLS)
     # Not to be moved after the last measurement of what is in view.
     centre = look_at - away * (place.max(axis=0) + place.min(axis=0)) / 2 @ axes
     return len(np.unique(cells @ [1, 1j])), centre + away * towards, centre

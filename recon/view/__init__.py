@@ -1,6 +1,6 @@
 """A map in the browser, on this machine alone.
 
-`scene.py`: what is shown, as values; `follow.py`: the scene of a map, also of one that grows, and
-what its keyframes saw; `server.py`: the page, made by viser; `guard.py`: who is let into it, and
-what is taken from it.
+`follow.py`: the scene of a map, also of one that grows, and what its keyframes saw; `server.py`:
+the page, made by viser; `guard.py`: who is let into it, and what is taken from it. A scene is what
+reports draw, too: `report/`.
 """

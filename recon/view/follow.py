@@ -28,14 +28,13 @@ from recon.map.localize.localizer import State
 from recon.map.map import Map
 from recon.map.sessions.placed import settings_of
 from recon.map.store.map_file import MapViews
-from recon.report.scene import thin_mesh
+from recon.report.scene import Points, Scene, thin_mesh
 from recon.report.style import REASON_LABELS, colour_disparity, colour_reasons, hatch
 from recon.run.directory import state_folder
 from recon.run.finished import STATES, states_of
 from recon.run.run import SUMMARY
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
-from recon.view.scene import Points, Scene
 
 _MOST_FACES: Final = 400_000
 # Not to be trusted, trusted but without a place in the map, in the map.
@@ -133,7 +132,8 @@ def _snapshot(run: Path, path: Path, taken: list[Scene]) -> Scene:
         lines = [str(run), f"frame {len(drive)} of {drive.info.frames}, it is being mapped"]
         points = tuple(part for one in taken for part in one.points)
         grids = tuple(grid for one in taken for grid in one.grids)
-        return Scene(lines, points, settings_of(drive).fusion.voxel_m, grids, None, _paths(map_))
+        spacing_m = settings_of(drive).fusion.voxel_m
+        return Scene(points, paths=_paths(map_), grids=grids, lines=lines, spacing_m=spacing_m)
 
 
 def _submap(map_: Map, number: int) -> Scene:
@@ -141,14 +141,14 @@ def _submap(map_: Map, number: int) -> Scene:
     submap, T = drive.submaps[number], drive.T_map_world
     sums = submap.fused.cloud(settings.fusion.voxel_m, settings.fusion.min_count)
     if not len(sums) or not len(submap.occupancy):
-        return Scene(())
+        return Scene()
     cloud = transform_cloud(sums, T, frame="map")
     voxels = submap.occupancy.voxels(settings.occupancy.resolution_m)
     path_m = apply(T, drive.odometry.positions_m[submap.first_frame :][: submap.frames])
     ground = estimate_ground_surface(cloud, path_m, settings.ground)
     height_m = float(path_m[:, 2].mean() - np.nan_to_num(ground.camera_height_m))
     points = _dated([Points(f"{number}", cloud)], _paths(map_))
-    return Scene((), points, grids=((flatten(voxels, ground, settings.grid), height_m),))
+    return Scene(points, grids=((flatten(voxels, ground, settings.grid), height_m),))
 
 
 class KeyframeViews:

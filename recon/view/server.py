@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 from threading import Event
@@ -12,23 +12,26 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import require
-from recon.core.values import UNKNOWN, OccupancyGrid
+from recon.core.values import UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64
-from recon.view.guard import Guard, stop
-from recon.view.scene import (
+from recon.report.scene import (
     COLOURINGS,
-    MOST_POINTS,
     Points,
     Scene,
     colours,
     first_view,
-    halvings,
-    pick,
+    known_colourings,
+    near_others,
 )
+from recon.view.guard import Guard, stop
 
+MOST_POINTS: Final = 1_500_000  # in the browser: about 25 MB
+FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
+_TILE_VOXELS: Final = 256  # edge of what is thinned together
+_CLICK_RAD: Final = 0.006  # about five pixels of a screen
+_HALF_VIEW: Final = (0.9, 0.7)  # tangents across and up of what viser's page has in view at first
 # Shown at first. A grid is flat, and the ground is not: behind a bend it would hide the road.
 _LAYERS: Final = {"cloud": True, "grid": False, "mesh": False, "path": True}
-FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
 _FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
 _LINE: Final[Any] = {"thickness": 3.0, "thickness_units": "screen"}
 
@@ -59,7 +62,8 @@ class Viewer:
     def show(self, run: Path, scene: Scene) -> None:
         """Show the scene of a run, in place of its earlier one."""
         if scene.points and not self._parts:
-            self._eye_m, centre = first_view(scene)
+            xyz = np.concatenate([part.cloud.xyz[::16] for part in scene.points])
+            self._eye_m, centre = first_view(xyz[near_others(xyz)], _HALF_VIEW)
             self._server.initial_camera.position = self._eye_m
             self._server.initial_camera.look_at = centre
         self._scenes[run] = scene
@@ -67,9 +71,8 @@ class Viewer:
         self._parts = [part for one in scenes for part in one.points]
         views = [one.keyframes for one in scenes if one.keyframes is not None]
         self._keyframes = [(of, n) for of in views for n in range(len(of.T_map_camera))]
-        known = [by for by in COLOURINGS if all(p.values(by) is not None for p in self._parts)]
-        self._by.options, last = known, len(self._keyframes) - 1
-        self._known = known
+        self._known, last = known_colourings(self._parts), len(self._keyframes) - 1
+        self._by.options = self._known
         self._text.content = "<br>".join(_html(one.lines) for one in scenes)
         self._slider.max, self._slider.disabled = max(1, last), last < 0
         self._draw()
@@ -198,6 +201,39 @@ class Viewer:
             lines, self._image.visible = [*said, *lines], image is not None
             self._image.image = self._image.image if image is None else image
         self._said.content = _html(lines)
+
+
+def cut(cloud: PointCloud, spacing_m: float) -> tuple[Points, ...]:
+    """Cut a cloud into square tiles, seen from above."""
+    keys = (cloud.xyz[:, :2] // (_TILE_VOXELS * spacing_m)).astype(np.int64) @ [1 << 32, 1]
+    order = np.argsort(keys, kind="stable")
+    tiles = np.split(order, np.flatnonzero(np.diff(keys[order])) + 1)
+    return tuple(Points(f"{keys[own[0]]}", cloud.select(own)) for own in tiles if len(own))
+
+
+def halvings(parts: Sequence[Points], eye_m: Float64, limit: int = MOST_POINTS) -> list[int]:
+    """Return how often to halve each part to keep ``limit``: two more at twice the distance."""
+    sizes = np.array([len(part.cloud) for part in parts])
+    places = np.array([part.cloud.xyz[len(part.cloud) // 2] for part in parts])
+    distance_m = np.maximum(np.linalg.norm(places - eye_m, axis=1), 1e-3)
+    whole_m, times = float(distance_m.max()), np.zeros(len(parts), np.int64)
+    while (-(-sizes >> times)).sum() > max(limit, len(parts)):  # rounded up
+        whole_m /= np.sqrt(2.0)
+        times = np.ceil(2.0 * np.log2(np.maximum(distance_m / whole_m, 1.0))).astype(np.int64)
+    return [int(number) for number in times]
+
+
+def pick(parts: Sequence[Points], origin_m: Float64, direction: Float64) -> Float64 | None:
+    """Return the nearest point (3,) that a ray passes close by; None where there is none."""
+    best_m, best = np.inf, None
+    for part in parts:
+        xyz = part.cloud.xyz - origin_m
+        along_m = xyz @ direction
+        aside_m = np.linalg.norm(xyz - along_m[:, None] * direction, axis=1)
+        along_m[aside_m > _CLICK_RAD * along_m] = np.inf
+        if along_m.min() < best_m:
+            best_m, best = along_m.min(), part.cloud.xyz[along_m.argmin()].astype(np.float64)
+    return best
 
 
 def _html(lines: Iterable[str]) -> str:

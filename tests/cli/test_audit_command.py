@@ -52,7 +52,7 @@ def test_a_good_drive_is_announced_measured_and_found_good(good, tmp_path):
     ):
         assert words in done.stdout
     page = (tmp_path / "audited" / "report.html").read_text()
-    for words in ("Verdict: good", "Epipolar errors", "Disparity", "Exposure, focus and rows"):
+    for words in ("Verdict: good", "Epipolar errors", "Disparity", "Exposure, focus"):
         assert words in page
     summary = json.loads((tmp_path / "audited" / "summary.json").read_text())
     assert summary["verdict"] == "good"

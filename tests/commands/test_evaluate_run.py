@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from recon.core.values import PointCloud, Trajectory
 from recon.evaluation.trajectory import TrajectoryRules
 from recon.io.models.ply import read_ply, write_ply
 from recon.io.trajectory import read_trajectory, write_kitti_poses, write_tum
+from recon.report.map_page import ALIGNED
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 T_MAP_WORLD = make_transform(exp_so3(np.array([0.3, -1.2, 0.8])), np.zeros(3))
@@ -233,3 +235,8 @@ def test_a_folder_gets_report_figures_and_aligned_paths(folder):
     files, rules = (out / "estimate_aligned_tum.txt", out / "truth_tum.txt"), TrajectoryRules
     again = run_evaluate_trajectory(*files, rules(alignment="none")).to_json()
     assert again["ate_m"] == pytest.approx(found["ate_m"], abs=1e-9)
+
+
+def test_a_report_can_say_of_every_alignment_what_it_did():
+    alignments = get_args(TrajectoryRules.model_fields["alignment"].annotation)
+    assert set(alignments) == set(ALIGNED)

@@ -25,9 +25,9 @@ from recon.commands.map_options import MapOptions
 from recon.core.progress import Counted, Silent, showing
 from recon.io.models.ply import read_ply
 from recon.io.models.rasters import read_grid
+from recon.report.scene import colours
 from recon.run.directory import STARTED, state_folder
 from recon.view.follow import add_located, finish, follow_located, grow
-from recon.view.scene import colours
 from tests.flow.conftest import SMALL_STREET
 from tests.hostile.refusals import assert_refused, run
 from tests.scenery import chromium

@@ -61,8 +61,8 @@ def main(folder: Path) -> None:
     from recon.io.models.ros_bag import header, points
     from recon.map.map import Map
     from recon.map.sessions.copying import keep_map
+    from recon.report.scene import COLOURINGS, Points, colours
     from recon.stereo.frame import voxel_downsample
-    from recon.view.scene import COLOURINGS, Points, colours
     from tests.map import walls
 
     plain = walls.wall

@@ -42,7 +42,7 @@ from recon.report import (
 )
 from recon.report import drive_figures as figures
 from recon.report.batch_page import sweep_figure
-from recon.report.page import page_environment, timing_figure
+from recon.report.page import embedded
 from recon.run.batch.job import Job, Outcome
 from recon.run.batch.results import JobResult
 from tests.scenery.calibrated import GOOD
@@ -131,16 +131,11 @@ def test_figures_say_in_words_what_is_seen_in_this_run(
     assert "Grid of 15 by 10 m, 33 % of the cells known, 90 % of them free" in seen
     assert "path 1 to 2.5, median 1.75" in seen
     assert len(boxes) == 4  # the grid, and the keys of its legend
-    assert (
-        "most in mesh 3.20 s, match 1.10 s" in notes(timing_figure({"match": 1.1, "mesh": 3.2}))[0]
-    )
     assert "measured 75.0 %, border 25.0 %" in notes(pair_page.reasons_figure(disparity))[0]
 
 
 def test_a_dark_page_changes_paper_and_ink_but_no_colours_of_values(pair, disparity):
-    shown = page_environment().filters["embedded"](
-        pair_page.disparity_figure(disparity, pair.camera)
-    )
+    shown = embedded(pair_page.disparity_figure(disparity, pair.camera))
     ink, picture = (
         np.asarray(Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))))
         for _, url in shown["layers"]
@@ -158,11 +153,10 @@ def test_every_figure_of_a_pair_is_a_png(which, pair, disparity, nothing_found):
     """With doffs, disparities may be negative; they have no depth here, where doffs is 0."""
     below = replace(disparity, values=disparity.values - 20)
     shown = {"disparity": disparity, "nothing_found": nothing_found}.get(which, below)
-    found = pair_page.stereo_figures(pair, shown)
-    assert found.pop("wide")
-    assert found.pop("valid_percent") == 100 * shown.measured.mean()
-    assert found.pop("inferred_percent") == 0.0
-    for png in (*found.values(), pair_page.error_figure(shown.values)):
+    found = pair_page.stereo_blocks(pair, shown)
+    assert all(block.wide for block in found)
+    assert f"{100 * shown.measured.mean():.1f} % of the pixels were measured." in found[1].caption
+    for png in (*(block.png for block in found), pair_page.error_figure(shown.values)):
         picture(png)
 
 
@@ -211,17 +205,6 @@ def test_a_figure_shows_its_picture(pair, disparity):
     assert [*disparity.reason_ratios.items()] == [(Reason.VALID, 0.75), (Reason.BORDER, 0.25)]
 
 
-# The second is what Teddy has; the last, a wall.
-@pytest.mark.parametrize("ends", [(4.1, 65.0), (1.25, 1.72), (0.31, 0.62), (50.1, 51.0)])
-def test_every_depth_scale_has_several_round_marks_that_do_not_touch(ends):
-    limits = math.log(ends[0]), math.log(ends[1])
-    marks = pair_page.depth_marks(*ends, math.log, limits)
-    assert 4 <= len(marks) <= 11
-    assert ends[0] <= marks[0] < marks[-1] <= ends[1]
-    assert np.diff(np.log(marks)).min() >= 0.0999 * (limits[1] - limits[0])
-    assert max(len(f"{mark:g}") for mark in marks) <= 4
-
-
 @pytest.mark.parametrize("frames", [0, 1, 3])
 def test_path_of_any_length_is_drawn(frames, T_map_world):
     path, longer = (
@@ -241,15 +224,6 @@ def test_grids_health_and_times_are_drawn_whatever_is_known(grid, trajectory, T_
     measured = [OdometryHealth(9, 8, 0.2, 0.1)] * 5
     for health in ([], [OdometryHealth()] * 3, [OdometryHealth(ok=False)], measured):
         picture(figures.health_figure(health))
-    for stages in ({}, {"match": 0.0}, {"match": 3.2, "mesh": 1.1}):
-        picture(timing_figure(stages))
-
-
-@pytest.mark.parametrize(
-    ("target", "length"), [(34.0, 20.0), (0.7, 0.5), (1.0, 1.0), (99.9, 50.0), (5.0, 5.0)]
-)
-def test_scale_bar_has_a_round_length_that_fits(target, length):
-    assert figures.nice_length(target) == pytest.approx(length)
 
 
 def test_a_thinned_grid_keeps_its_obstacles_and_its_place():
@@ -270,6 +244,29 @@ def drawn(monkeypatch):
     found: list[Figure] = []
     monkeypatch.setattr(style, "to_png", lambda figure, _="": found.append(figure) or b"")
     return found
+
+
+# The second is what Teddy has; the last, a wall.
+@pytest.mark.parametrize("ends", [(4.1, 65.0), (1.25, 1.72), (0.31, 0.62), (50.1, 51.0)])
+def test_every_depth_scale_has_several_marks(ends, drawn):
+    pair_page.depth_figure(np.geomspace(*ends, 200).reshape(10, 20))
+    bar = drawn[0].axes[1]
+    low, high = bar.get_xlim()
+    marks = [mark for mark in bar.get_xticks() if low <= mark <= high]
+    assert 3 <= len(marks) <= 9
+    assert (low, high) == pytest.approx(ends, rel=0.1)
+
+
+def test_disparities_have_their_depths_above_them(pair, disparity, drawn):
+    pair_page.disparity_figure(disparity, pair.camera)
+    (upper,) = (
+        axes for axes in drawn[0].axes if axes.get_xticklabels()[0].get_text().endswith("m")
+    )
+    depths = [float(label.get_text().removesuffix(" m")) for label in upper.get_xticklabels()]
+    assert len(depths) >= 4
+    camera = pair.camera
+    expected = camera.focal_px * camera.baseline_m / (upper.get_xticks() + camera.doffs_px)
+    np.testing.assert_allclose(depths, expected, rtol=0.01)
 
 
 def test_path_is_drawn_with_truth_drift_and_frames_that_are_not_trusted_or_without(

@@ -44,11 +44,10 @@ def test_a_picture_has_the_places_and_colours_of_the_value():
     grid = VALUES[6].plot().axes[0]
     assert list(grid.images[0].get_extent()) == [-1.0, 0.5, 2.0, 2.5]
     assert grid.images[0].get_array()[0, 1].tolist() == [24, 28, 34]
-    points = VALUES[3].plot().axes[0].collections[0]
-    ahead, left, up = (np.asarray(x) for x in points._offsets3d)
-    np.testing.assert_allclose(np.stack([-left, -up, ahead], 1), XYZ, atol=1e-6)
-    dots = VALUES[2].plot().axes[0].collections[0]
-    np.testing.assert_allclose(dots.get_facecolor()[0, :3], 0.2)
+    (image,) = VALUES[2].plot().axes[0].images
+    pixels = np.asarray(image.get_array())
+    assert (pixels[pixels[..., 3] == 255] == (51, 51, 51, 255)).all()
+    assert 0 < (pixels[..., 3] == 255).mean() < 0.5
 
 
 def test_what_was_inferred_is_hatched():
@@ -60,12 +59,6 @@ def test_what_was_inferred_is_hatched():
     assert len(axes.images) == 2
     assert axes.get_legend().get_texts()[0].get_text() == "inferred from planes around"
     assert len(whole.plot().axes[0].images) == 1
-
-
-def test_a_large_cloud_is_thinned():
-    xyz = np.random.default_rng(1).uniform(-9, 9, (60_000, 3)).astype(np.float32)
-    drawn = recon.PointCloud(xyz).plot().axes[0].collections[0]
-    assert 1000 < len(drawn.get_offsets()) <= 20_000
 
 
 def test_open3d_gets_copies_with_colours_and_normals():

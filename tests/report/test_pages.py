@@ -15,18 +15,20 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 import pytest
-from jinja2 import UndefinedError
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from recon.core.values import DisparityMetrics, DisparityTruth, PointCloud, Reason, Trajectory
 from recon.evaluation.map import DriveErrors
 from recon.odometry.protocol import OdometryHealth
-from recon.report.map_page import map_content, write_joined_page
-from recon.report.page import command_line, page_environment, render_page, summary_rows, write_page
-from recon.report.pair_page import pair_content, write_disparity_images, write_pair_page
-from recon.report.scene import Scene, plot_scene
+from recon.report.map_page import map_page, write_joined_page
+from recon.report.page import command_line, embedded, render_page, write_page
+from recon.report.pair_page import pair_page, write_disparity_images, write_pair_page
+from recon.report.scene import Points, Scene
+from recon.report.sections import Image as Figure
+from recon.report.sections import Page, Section, Table, View3D
 from recon.report.style import REASON_COLOURS
+from recon.report.view3d import plot, view_of
 from recon.run.directory import RunDirectory
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
@@ -76,17 +78,16 @@ def rows(block: str) -> list[tuple[str, ...]]:
     return [tuple(unescape(cell.replace("<wbr>", "")) for cell in row) for row in cells]
 
 
-def drive_content(run: SimpleNamespace) -> dict[str, Any]:
-    return map_content(run.map_, run.made, run.errors, run.sample, run.rig)
+def drive_page(run: SimpleNamespace) -> Page:
+    return map_page(run.map_, run.made, run.errors, run.sample, run.rig, run.summary)
 
 
 def map_html(run: SimpleNamespace) -> str:
-    found = run.summary
-    return render_page("map", found=found, warnings=found["warnings"], **drive_content(run))
+    return render_page(drive_page(run))
 
 
 def pair_html(run: SimpleNamespace) -> str:
-    return render_page("pair", found=run.summary, warnings=run.warnings, **pair_content(run))  # type: ignore[arg-type]
+    return render_page(pair_page(run))  # type: ignore[arg-type]
 
 
 def png(image: np.ndarray) -> bytes:
@@ -98,91 +99,97 @@ def png(image: np.ndarray) -> bytes:
 BLACK = png(np.zeros((2, 2, 3), np.uint8))
 
 
-def view(coloured: bool = False) -> dict[str, Any] | None:
+def view(coloured: bool = False, path: str = "path") -> Scene:
     rgb = np.eye(3, dtype=np.uint8) if coloured else None
-    return plot_scene(Scene(np.eye(4), PointCloud(np.eye(3, dtype=np.float32), rgb=rgb)))
+    cloud = PointCloud(np.eye(3, dtype=np.float32), rgb=rgb)
+    return Scene((Points("cloud", cloud),), paths=(Points(path, cloud),))
 
 
-def audit_page(text: str = "plain", **changes: Any) -> str:
+def some_page(text: str = "plain", found: dict[str, Any] | None = None, **changes: Any) -> Page:
     """A page with a text in every place that can be foreign."""
-    pair = {"index": 3, "images": BLACK, "rows": None, "disparity": BLACK, "wide": True}
-    content = {
-        "source": SimpleNamespace(name=f"Source {text}", description=f"Description {text}"),
-        "lines": {"frames": f"Frames {text}", f"Check {text}": f"Cell {text}"},
-        "found": {"baseline_m": 0.5, "epipolar_error_rms_px": None, "depth_error_m": None},
-        "rig": None,
-        "frames": None,
-        "pairs": [{**pair, "valid_percent": 75.0}],
-        "warnings": [f"Warning {text}"],
-        "verdict": f"Word {text}",
-        "command": f"recon {text}",
-        "config": f"key: {text}",
-        "versions": {f"Package {text}": f"Version {text}"},
-    }
-    return render_page("audit", **{**content, **changes})
-
-
-def scene_page(plot: dict[str, Any] | None, times: int = 1) -> str:
-    """A page with the same view several times."""
-    calls = "{{ scene('In 3-D', plot, 'caption') }}" * times
-    template = (
-        '{% extends "page.html.j2" %}{% from "parts.html.j2" import scene, section %}'
-        "{% block body %}{% call section('S') %}" + calls + "{% endcall %}{% endblock %}"
+    table = Table(f"Table {text}", (), [(f"Check {text}", f"Cell {text}")])
+    linked = Table(
+        "Links", ("job", "state", f"Head {text}"), [(text, "a", "b")], links={text: text}
     )
-    return page_environment().from_string(template).render(plot=plot)
+    content: dict[str, Any] = {
+        "title": f"Title {text}",
+        "subtitle": f"Subtitle {text}",
+        "figures": [(f"Label {text}", f"Figure {text}"), ("Unknown", "")],
+        "sections": [
+            Section("Empty", [Figure("No figure", None), Table("No row", ("a",), [])]),
+            Section(f"Section {text}", [table, linked], f"Intro {text}"),
+            Section("Drawn", [Figure(f"Image {text}", BLACK, f"Caption {text}")]),
+        ],
+        "found": found or {"warnings": [f"Warning {text}"], "verdict": f"Word {text}"},
+    }
+    return Page(**{**content, **changes})
+
+
+def some_html(text: str = "plain", **changes: Any) -> str:
+    made = (f"recon {text}", f"key: {text}", {f"Package {text}": f"Version {text}"})
+    return render_page(some_page(text, **changes), *made)
+
+
+def scene_page(scene: Scene | None, times: int = 1) -> str:
+    """A page with the same view several times."""
+    section = Section("S", [View3D("In 3-D", scene, "caption")] * times)
+    return render_page(some_page(sections=[section]))
 
 
 def test_report_loads_nothing_from_outside_and_the_browser_would_refuse_it():
-    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', audit_page())
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', some_html())
     assert "default-src 'none'" in policy[1]
-    for page in (audit_page(), scene_page(view())):
-        assert all(target.startswith(("data:", "#")) for target in Loads(page).loads)
+    for page in (render_page(some_page()), scene_page(view())):
+        links = [target for target in Loads(page).loads if target != "plain"]
+        assert all(target.startswith(("data:", "#")) for target in links)
         assert "link" not in Loads(page).tags
         assert not re.search(r"@import|url\(", page)
         assert not re.search(r"https?://", page)
 
 
 def test_text_cannot_end_a_page_and_every_element_is_closed():
-    page, plain = Loads(audit_page(NASTY)), Loads(audit_page())
+    page, plain = Loads(some_html(NASTY)), Loads(some_html())
     assert (page.open, page.tags) == ([], plain.tags)
-    parts = ("Source", "Description", "Frames", "Check", "Cell", "Warning", "Word", "Package")
-    for part in (*parts, "Version", "recon", "key:"):
+    parts = ("Title", "Subtitle", "Label", "Figure", "Section", "Intro", "Table", "Check", "Cell")
+    parts += ("Head", "Image", "Caption", "Warning", "Word", "Package", "Version", "recon", "key:")
+    for part in parts:
         assert f"{part} {NASTY}" in page.text
         assert f"{part} plain" in plain.text
-    plot = view()
-    plot["data"][0]["name"] = '</script><b>"'
-    page = scene_page(plot)
-    assert "</script><b>" not in page
-    assert Loads(page).open == []
-    (packed,) = re.findall(r'<script type="application/json">(.*?)</script>', page)
-    assert json.loads(packed) == plot
+    assert not any("<" in target or "'" in target for target in page.loads)
+    scene = view(path='</script><b>"')
+    html = scene_page(scene)
+    assert "</script><b>" not in html
+    assert Loads(html).open == []
+    (packed,) = re.findall(r'<script type="application/json">(.*?)</script>', html)
+    assert json.loads(packed) == plot(view_of(scene, 9))
 
 
 def test_contents_come_first_then_warnings_and_long_names_are_broken():
-    page = audit_page()
-    assert 0 < page.index("Warning plain") < page.index("<dt>Baseline") < page.index("<img")
-    assert "No warnings" in audit_page(warnings=(), verdict="")
-    assert "2 warnings" in audit_page(warnings=("a", "b"), verdict="")
-    page = audit_page(lines={"frames": "1", "trajectory.ate_max_m": "0.05"})
-    sections = [("1", "Measured"), ("2", "Pair 3")]
+    page = some_html()
+    assert 0 < page.index("Warning plain") < page.index("<dt>Label plain") < page.index("<img")
+    assert "Unknown" not in page
+    assert "No warnings" in some_html(found={"warnings": ()})
+    assert "2 warnings" in some_html(found={"warnings": ("a", "b")})
+    assert "1 warning" in some_html(found={"seconds": 1.0}, warnings=["of the page"])
+    sections = [("1", "Section plain"), ("2", "Drawn"), ("3", "How it was made")]
     assert re.findall(r'<a href="#section-(\d)">([^<]+)</a>', page) == sections
     assert re.findall(r'<section id="section-(\d)">\s*<h2>([^<]+)', page) == sections
+    long = Table("t", (), [("trajectory.ate_max_m", "0.05")])
+    page = some_html(sections=[Section("S", [long])])
     assert "trajectory.<wbr>ate_<wbr>max_<wbr>m</th><td>0.05</td>" in page
-    with pytest.raises(UndefinedError):
-        render_page("audit")
 
 
 @pytest.mark.parametrize(
-    ("content", "kind"),
+    ("found", "kind"),
     [
-        ({"warnings": (), "verdict": ""}, "good"),
-        ({"warnings": ("w",), "verdict": ""}, "warn"),
+        ({"warnings": ()}, "good"),
+        ({"warnings": ("w",)}, "warn"),
         ({"warnings": ("w",), "verdict": "usable"}, "warn"),
-        ({"warnings": ("w",), "verdict": "good", "sound": True}, "good"),
+        ({"warnings": ("w",), "verdict": "good"}, "good"),
     ],
 )
-def test_only_what_is_wrong_is_alarming(content, kind):
-    page = audit_page(**content)
+def test_only_what_is_wrong_is_alarming(found, kind):
+    page = some_html(found=found)
     assert f'class="notice {kind}"' in page
     assert ('role="alert"' in page) == (kind == "warn")
 
@@ -193,7 +200,7 @@ def test_plotly_travels_once_and_colourings_get_a_button_each_where_there_is_a_c
     packed = re.findall(r'<script type="text/plain" id="plotly">([^<]*)</script>', page)
     assert len(packed) == 1
     assert gzip.decompress(base64.b64decode(packed[0])).decode() == get_plotlyjs()
-    without = audit_page()
+    without = some_html()
     assert 'id="plotly"' not in without
     assert len(without) < 20_000
     page = scene_page(view(coloured=True))
@@ -201,17 +208,6 @@ def test_plotly_travels_once_and_colourings_get_a_button_each_where_there_is_a_c
     assert "</button>" not in scene_page(view())
     # A scene of nothing is left out, and with it its section.
     assert not re.search("In 3-D|#section-", scene_page(None))
-
-
-def test_figures_of_each_part_are_rows_of_their_own():
-    found: dict[str, Any] = {"by_length": [{"length_m": 50.0, "segments": 15}]}
-    found |= {"views_dropped": [], "stages": {"match": 1.0}, "nested": {"a": [1, None]}}
-    assert summary_rows(found) == [
-        ("by_length.0.length_m", "50 m"),
-        ("by_length.0.segments", "15"),
-        ("views_dropped", "none"),
-        ("nested.a", "1, –"),
-    ]
 
 
 @pytest.mark.parametrize(
@@ -232,7 +228,7 @@ def test_page_of_a_drive_shows_all_that_the_run_has(drive):
     assert {title for title, inside in blocks(page).items() if "<img" in inside} == {
         "Occupancy grid", "Path from above", "Error along the path", "Health of the odometry",
         "Input pair", "Disparity", "Depth", "Why pixels have no disparity", "Confidence",
-        "Time by stage", "What the calibration does to disparities", "In 3-D",
+        "What the calibration does to disparities", "In 3-D",
     }  # fmt: skip
     assert key_figures(page) == {
         "Path": "10.0 m", "Drift (t_rel)": "0.62 %", "Position error (ATE)": "0.410 m",
@@ -240,8 +236,9 @@ def test_page_of_a_drive_shows_all_that_the_run_has(drive):
     }  # fmt: skip
     shown = blocks(page)
     assert 'class="scene"' in shown["In 3-D"]
-    table = rows(shown["All figures"])
-    assert {("nested.a", "1, –"), ("fps", "4.25 frames/s")} <= set(table)
+    assert rows(shown["Time by stage"]) == [("match", "1.00 s", "100 %")]
+    assert "fps: 4.25" in page
+    assert "nested:\n  a: [1, null]" in page
     assert ("segments", "3 of 5 m") in rows(shown["Path against truth"])
     assert "Stereo, frame 7" in page
     assert 1e5 < len(page.encode()) < MAX_BYTES
@@ -280,7 +277,7 @@ def test_page_of_a_pair_tells_what_was_inferred_from_what_was_measured(view, bot
 def test_a_picture_that_is_too_long_for_its_format_is_shown_smaller():
     buffer = io.BytesIO()
     Image.new("RGB", (40, 20_000)).save(buffer, "PNG")
-    ((_, url),) = page_environment().filters["embedded"](buffer.getvalue())["layers"]
+    ((_, url),) = embedded(buffer.getvalue())["layers"]
     with Image.open(io.BytesIO(base64.b64decode(url.partition(",")[2]))) as image:
         assert max(image.size) == 16_383
 
@@ -351,9 +348,12 @@ def test_a_map_compared_with_the_truth_is_tabulated(drive):
 
 
 def test_notes_of_the_odometry_and_paths_in_the_axes_of_the_cloud_are_shown(drive):
-    plot: dict[str, Any] = drive_content(drive)["view"]
-    assert [trace["name"] for trace in plot["data"]][-2:] == ["path", "true path"]
-    low, high = plot["layout"]["scene"]["xaxis"]["range"]
+    scene = drive_page(drive).sections[0].blocks[0].scene
+    assert [trace["name"] for trace in plot(view_of(scene, 9))["data"]][-2:] == [
+        "path",
+        "true path",
+    ]
+    low, high = plot(view_of(scene, 9))["layout"]["scene"]["xaxis"]["range"]
     # Both run from 0 to 10 m forward in map axes.
     assert low == pytest.approx(0.0, abs=0.3)
     assert high == pytest.approx(10.0, abs=0.3)
@@ -398,7 +398,7 @@ class Found(dict[str, Any]):
 def test_runs_leave_their_pages_and_images(drive, view, tmp_path):
     view.summary = Found(view.summary)
     for name, write in (
-        ("drive", lambda run: write_page("map", run, drive.summary, **drive_content(drive))),
+        ("drive", lambda run: write_page(drive_page(drive), run)),
         ("pair", lambda run: write_pair_page(view, run)),
     ):
         with RunDirectory(tmp_path / name) as directory:

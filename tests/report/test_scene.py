@@ -10,14 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.core.values import PointCloud
-from recon.report.scene import (
-    T_UPRIGHT_CAMERA,
-    Scene,
-    plot_scene,
-    quantise_colours,
-    thin_cloud,
-    thin_mesh,
-)
+from recon.report.scene import Points, Scene, thin_cloud, thin_mesh, upright_scene
+from recon.report.view3d import plot, quantise_colours, view_of
+
+
+def scene_of(cloud: PointCloud, **more: Any) -> Scene:
+    return Scene((Points("cloud", cloud),), **more)
+
+
+def plotted(scene: Scene, max_points: int = 120_000) -> dict[str, Any]:
+    return plot(view_of(scene, max_points))
 
 
 def unpack(packed: dict[str, str]) -> np.ndarray[Any, Any]:
@@ -27,11 +29,11 @@ def unpack(packed: dict[str, str]) -> np.ndarray[Any, Any]:
 def test_points_are_turned_upright_and_their_colours_come_back_from_the_scale():
     """Camera axes: forward is z and up is -y; in the view forward is x and up is z."""
     ahead_and_up = PointCloud(np.array([[0, -2, 5], [0, -2, 5]], dtype=np.float32))
-    trace = plot_scene(Scene(T_UPRIGHT_CAMERA, ahead_and_up))["data"][0]
+    trace = plotted(upright_scene(ahead_and_up))["data"][0]
     assert [unpack(trace[axis])[0] for axis in "xyz"] == [5.0, 0.0, 2.0]
     rgb = np.array([[10, 20, 30], [200, 100, 0]], dtype=np.uint8)
     cloud = PointCloud(np.array([[0, 0, 0], [1, 1, 1]], dtype=np.float32), rgb=rgb)
-    marker = plot_scene(Scene(np.eye(4), cloud))["data"][0]["marker"]
+    marker = plotted(scene_of(cloud))["data"][0]["marker"]
     named = [marker["colorscale"][place][1] for place in unpack(marker["color"])]
     assert named == ["rgb(10,20,30)", "rgb(200,100,0)"]
     assert marker["cmax"] == len(marker["colorscale"]) - 1
@@ -39,28 +41,30 @@ def test_points_are_turned_upright_and_their_colours_come_back_from_the_scale():
 
 
 def test_coloured_cloud_can_also_be_shown_by_height(cloud):
-    both = plot_scene(Scene(np.eye(4), cloud))
+    both = plotted(scene_of(cloud))
     colourings = both["layout"]["meta"]
     assert [colouring["label"] for colouring in colourings] == ["image", "height"]
     lengths = {len(unpack(colouring["marker"]["color"])) for colouring in colourings}
     assert lengths == {len(unpack(both["data"][0]["x"]))}
-    scale = colourings[1]["marker"]["colorscale"]
-    assert [scale[0][0], scale[-1][0]] == [0.0, 1.0]
-    assert "#30123b" in scale[0]  # turbo: from dark blue …
-    assert "#7a0402" in scale[-1]  # … to dark red
+    marker, z = colourings[1]["marker"], unpack(both["data"][0]["z"])
+    named = [marker["colorscale"][place][1] for place in unpack(marker["color"])]
+    for place, rgb in ((z.argmin(), (48, 18, 59)), (z.argmax(), (122, 4, 3))):
+        shown = [int(band) for band in named[place][4:-1].split(",")]
+        assert shown == pytest.approx(rgb, abs=1)  # turbo: from dark blue to dark red
+    assert colourings[1]["legend"].endswith("m, blue to red")
     plain = PointCloud(cloud.xyz, frame="map")
-    assert len(plot_scene(Scene(np.eye(4), plain))["layout"]["meta"]) == 1
+    assert len(plotted(scene_of(plain))["layout"]["meta"]) == 1
 
 
 def test_axes_have_true_proportion_whatever_lies_far_away(cloud):
     flat = PointCloud(cloud.xyz * np.array([1.0, 0.5, 0.1], dtype=np.float32))
-    layout = plot_scene(Scene(np.eye(4), flat))["layout"]["scene"]
+    layout = plotted(scene_of(flat))["layout"]["scene"]
     sides = {axis: np.ptp(layout[f"{axis}axis"]["range"]) for axis in "xyz"}
     aspect = layout["aspectratio"]
     assert max(aspect.values()) == pytest.approx(2.0)
     assert aspect["y"] / aspect["x"] == pytest.approx(sides["y"] / sides["x"])
     far = np.concatenate([cloud.xyz, [[1e4, 0, 0]]]).astype(np.float32)
-    layout = plot_scene(Scene(np.eye(4), PointCloud(far)))["layout"]["scene"]
+    layout = plotted(scene_of(PointCloud(far)))["layout"]["scene"]
     assert np.ptp(layout["xaxis"]["range"]) < 20.0
 
 
@@ -75,17 +79,29 @@ def test_axes_have_true_proportion_whatever_lies_far_away(cloud):
 )
 def test_eye_in_metres_is_where_the_layout_looks_from(far_m, eye_m, expected):
     corners = np.array([[0, 0, 0], [far_m] * 3], dtype=np.float32)
-    eye = plot_scene(Scene(np.eye(4), PointCloud(corners), eye_m=eye_m))["layout"]["scene"][
-        "camera"
-    ]
-    assert tuple(eye["eye"].values()) == pytest.approx(expected)
+    scene = plotted(scene_of(PointCloud(corners), eye_m=eye_m))["layout"]["scene"]
+    assert tuple(scene["camera"]["eye"].values()) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("paths", [(), (("path", np.zeros((3, 3))),), (("p", np.zeros((0, 3))),)])
-def test_scene_of_one_place_is_valid_json_and_of_none_is_not_drawn(paths):
+@pytest.mark.parametrize("poses", [None, 3, 0])
+def test_scene_of_one_place_is_valid_json_and_one_of_none_is_empty(poses):
     one, empty = (PointCloud(np.zeros((n, 3), dtype=np.float32)) for n in (1, 0))
-    json.dumps(plot_scene(Scene(np.eye(4), one, None, paths)), allow_nan=False)
-    assert plot_scene(Scene(np.eye(4), empty, None, paths)) is None
+    path = np.zeros((poses or 0, 3), np.float32)
+    paths = () if poses is None else (Points("path", PointCloud(path)),)
+    json.dumps(plotted(scene_of(one, paths=paths)), allow_nan=False)
+    assert not scene_of(one, paths=paths).empty
+    assert scene_of(empty, paths=paths).empty
+    assert Scene(paths=paths).empty
+
+
+def test_a_path_has_one_colour_or_that_of_each_pose(cloud):
+    rgb = np.array([[1, 2, 3], [1, 2, 3], [250, 0, 0]], np.uint8)
+    ways = [PointCloud(np.eye(3, dtype=np.float32)[:n], rgb[:n]) for n in (2, 3)]
+    paths = tuple(Points(f"{n}", way) for n, way in enumerate(ways))
+    one, each = (trace["line"] for trace in plotted(scene_of(cloud, paths=paths))["data"][1:])
+    assert one["color"] == "rgb(1,2,3)"
+    named = [each["colorscale"][place][1] for place in unpack(each["color"])]
+    assert named == ["rgb(1,2,3)", "rgb(1,2,3)", "rgb(250,0,0)"]
 
 
 def drive(angle_deg: float, length_m: float = 300.0) -> PointCloud:
@@ -98,7 +114,7 @@ def drive(angle_deg: float, length_m: float = 300.0) -> PointCloud:
 
 def seen_places(cloud: PointCloud) -> np.ndarray:
     """Where the points are in the first view: -1 to 1 from border to border, across and up."""
-    scene = plot_scene(Scene(np.eye(4), cloud))["layout"]["scene"]
+    scene = plotted(scene_of(cloud))["layout"]["scene"]
     box = np.array([scene[f"{axis}axis"]["range"] for axis in "xyz"])
     unit = scene["aspectratio"]["x"] / np.ptp(box[0])
     eye, centre = (np.array(list(scene["camera"][key].values())) for key in ("eye", "center"))
@@ -132,7 +148,7 @@ def test_thinned_cloud_is_a_part_of_the_cloud_within_the_limit(count, limit, see
 
 def test_thinned_cloud_keeps_its_extent_and_most_of_what_it_may(cloud):
     thinned = thin_cloud(cloud, 500)
-    (trace,) = plot_scene(Scene(np.eye(4), cloud), 500)["data"]  # type: ignore[index]
+    (trace,) = plotted(scene_of(cloud), 500)["data"]
     assert len(unpack(trace["x"])) == len(thinned)
     # A cell may not be much larger than needed, or detail would be lost for nothing.
     assert 250 <= len(thinned) <= 500

@@ -8,9 +8,9 @@ from PIL import Image
 
 from recon.core.values import PointCloud
 from recon.report import style
-from recon.report.scene import Scene, plot_scene
-from recon.report.still import draw_still
-from tests.report.test_pages import audit_page, pair_html, png, scene_page
+from recon.report.scene import Points, Scene
+from recon.report.view3d import draw_still, view_of
+from tests.report.test_pages import pair_html, scene_page, some_html
 from tests.scenery import chromium
 
 RED, BLUE = (250, 10, 10), (10, 10, 250)
@@ -26,8 +26,12 @@ def wall(x_m: float, half_m: float, rgb: tuple[int, int, int]) -> PointCloud:
 
 def still(*clouds: PointCloud, **more: object) -> tuple[np.ndarray, str]:
     xyz, rgb = (np.concatenate([getattr(c, name) for c in clouds]) for name in ("xyz", "rgb"))
-    scene = Scene(np.eye(4), PointCloud(xyz, rgb=rgb), eye_m=(-6.0, 0.0, 0.0), **more)  # type: ignore[arg-type]
-    with Image.open(io.BytesIO(draw_still(plot_scene(scene)))) as image:  # type: ignore[arg-type]
+    cloud = Points("cloud", PointCloud(xyz, rgb=rgb))
+    return drawn(Scene((cloud,), eye_m=(-6.0, 0.0, 0.0), **more))  # type: ignore[arg-type]
+
+
+def drawn(scene: Scene) -> tuple[np.ndarray, str]:
+    with Image.open(io.BytesIO(draw_still(view_of(scene, 120_000)))) as image:
         return np.asarray(image), image.info[style.SEEN]
 
 
@@ -46,19 +50,21 @@ def test_what_is_near_hides_what_is_far_and_nothing_is_drawn_around():
 
 
 def test_paths_are_upon_all_and_one_of_no_frame_is_left_out():
-    way = np.array([[3.0, -2.0, 0.0], [3.0, 2.0, 0.0]])  # behind the red wall
-    paths = [("path", way), ("nowhere", np.zeros((0, 3)))]
+    way = np.array([[3.0, -2.0, 0.0], [3.0, 2.0, 0.0]], np.float32)  # behind the red wall
+    found = PointCloud(way, np.tile(np.uint8([255, 82, 82]), (2, 1)))
+    paths = (Points("path", found), Points("nowhere", PointCloud(way[:0])))
     image, seen = still(wall(0.0, 1.0, RED), wall(6.0, 4.0, BLUE), paths=paths)
     middle = image[image.shape[0] // 2 + np.arange(-9, 10), image.shape[1] // 2, :3]
     assert (middle == (255, 82, 82)).all(axis=1).any()
-    assert "path, nowhere" in seen
+    assert "path, in a box" in seen
 
 
 def test_a_mesh_alone_and_a_scene_of_one_point_have_a_picture(mesh):
     one = PointCloud(np.zeros((1, 3), np.float32))
-    for scene in (Scene(np.eye(4), None, mesh), Scene(np.eye(4), one)):
-        with Image.open(io.BytesIO(draw_still(plot_scene(scene)))) as image:  # type: ignore[arg-type]
-            assert (np.asarray(image)[..., 3] == 255).any()
+    image, _ = drawn(Scene((Points("cloud", one),)))
+    assert (image[..., 3] == 255).any()
+    image, _ = drawn(Scene(mesh=mesh))
+    assert (image[image[..., 3] == 255] == (90, 90, 90, 255)).all()  # its own colour
 
 
 SCREEN = {"height": 900, "deviceScaleFactor": 1, "mobile": False}
@@ -96,14 +102,14 @@ def test_a_browser_prints_the_still_darkens_ink_alone_and_says_what_goes_on(view
 
 
 def test_a_view_has_its_still_a_role_and_a_name_and_figures_are_folded(view):
-    page = scene_page(plot_scene(Scene(np.eye(4), view.cloud)))
+    page = scene_page(Scene((Points("cloud", view.cloud),)))
     assert page.count('class="still" alt="View in 3-D of cloud (2,000 of 2,000 points)') == 1
     assert 'class="scene" role="img" aria-label="View in 3-D of cloud' in page
     inside = pair_html(view).partition('<details class="wide"><summary>All figures</summary>')[2]
-    assert 0 < inside.index("<td>") < inside.index("</details>")
+    assert 0 < inside.index("points: 2000") < inside.index("</details>")
 
 
 def test_an_image_without_notes_is_a_picture_that_its_title_names():
-    page = audit_page(frames=png(np.full((4, 4, 3), 90, np.uint8)))
-    assert 'class="picture" alt="Exposure, focus and rows" src="data:image/webp' in page
+    page = some_html()
+    assert 'class="picture" alt="Image plain" src="data:image/webp' in page
     assert 'class="ink"' not in page

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from recon.report import style
 from recon.report.batch_page import batch_tables, sweep_figure, write_batch_page
 from recon.report.middlebury_page import csv_table, middlebury_tables
-from recon.report.table import Table, join
+from recon.report.sections import Table, join
 from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult, compare
 from recon.run.directory import RunDirectory

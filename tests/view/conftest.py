@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from recon.core.values import PointCloud
-from recon.view.scene import Points, Scene
+from recon.report.scene import Points, Scene
 from recon.view.server import Viewer
 from tests.scenery import chromium
 
@@ -75,7 +75,7 @@ def small_scene(count: int = 1000, **how: object) -> Scene:
     cloud = PointCloud(
         rng.random((count, 3), np.float32), rng.integers(0, 255, (count, 3), np.uint8), frame="map"
     )
-    return Scene(["a scene"], (Points("0", cloud),), keyframes=Views(), **how)
+    return Scene((Points("0", cloud),), lines=["a scene"], keyframes=Views(), **how)
 
 
 @contextmanager

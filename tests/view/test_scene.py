@@ -3,7 +3,8 @@
 import numpy as np
 
 from recon.core.values import PointCloud
-from recon.view.scene import Points, cut, halvings, pick
+from recon.report.scene import Points
+from recon.view.server import cut, halvings, pick
 
 
 def spread(x_m: float, count: int = 1000) -> Points:
