@@ -94,7 +94,8 @@ def settings(
     name: Annotated[
         str | None,
         typer.Argument(
-            help="A setting, a group such as matching.sgm, or a part of a name.", show_default="all"
+            help="A setting, a group such as matching.onnx, or a part of a name.",
+            show_default="all",
         ),
     ] = None,
     markdown: Annotated[bool, opt.option("Print the page docs/settings.md.", "--markdown")] = False,
@@ -106,7 +107,7 @@ def settings(
     Change one with --set name=value, several with --config FILE.
 
     Examples:
-      recon settings matching.sgm
+      recon settings matching.onnx
       recon settings voxel
     """
     with one_line_errors(quiet=quiet):

@@ -15,7 +15,6 @@ from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
 from recon.core.errors import FormatError, SettingsError
-from recon.core.plugins import name_of
 from recon.core.settings import (
     Settings,
     alternatives,
@@ -36,7 +35,7 @@ from recon.run.finished import is_pair_run
 from recon.run.run import CONFIG
 from recon.sources.settings import SourceSettings
 from recon.stereo.frame import ANY_SCALE
-from recon.stereo.match.registry import MATCHERS, field_of
+from recon.stereo.match.registry import plugin_groups, settings_taken
 from recon.street.settings import StreetSettings
 
 Changes = Sequence[str | Mapping[str, Any]]
@@ -78,9 +77,9 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
         every = _recorded(self, usual)
         groups = {name: every[name] for name in GROUPS.get(command, every) if name in every}
         if "matching" in groups:
-            used = {name_of(self.matching.matcher), self.matching.keyframe_matcher or ""}
-            unused = {field_of(name) for name in MATCHERS} - {field_of(name) for name in used}
-            groups["matching"] = {k: v for k, v in groups["matching"].items() if k not in unused}
+            used = filter(None, (self.matching.matcher, self.matching.keyframe_matcher))
+            kept = {"matcher", "keyframe_matcher"}.union(*map(settings_taken, used))
+            groups["matching"] = {k: v for k, v in groups["matching"].items() if k in kept}
         if self.street == usual[0].street:
             groups.pop("street", None)
         return groups
@@ -108,10 +107,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 """The groups of settings that determine the result of each command."""
 
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
-    "matching": {
-        "matcher": "fine",
-        **{name: {"fill": True} for name in ("sad", "sgm", "fine")},
-    },
+    "matching": {"matcher": "fine", "fill": "ours"},
     "cloud": {"min_range_m": 0.0, "max_range_m": None, "max_relative_sigma": None},
     "filters": ANY_SCALE.model_dump(),
     "mesh": {"point_weight": 16.0},
@@ -131,7 +127,7 @@ def load_config(
     Args:
         path: A YAML file with any part of the configuration, such as a run's ``config.yaml``; or
             its content as a mapping; or a configuration that is to be changed.
-        overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``,
+        overrides: ``key=value`` texts with dotted keys, such as ``matching.window_px=9``,
             also several with commas; or mappings; or one of them.
         defaults: Defaults of a command that differ from those of the stages.
 
@@ -297,7 +293,9 @@ class SettingGroup:
 
 def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:
     """List the settings of a dotted name or part of one, and all below it; None = all."""
-    every = tuple(_groups(ReconConfig(), ReconConfig.parse(PAIR_DEFAULTS)))
+    brought = {"matching": {name: {} for name in plugin_groups()}}
+    defaults = (ReconConfig.parse(merge(brought, values)) for values in ({}, PAIR_DEFAULTS))
+    every = tuple(_groups(*defaults))
     names = [entry.name for group in every for entry in group.settings]
     if name is None:
         return every

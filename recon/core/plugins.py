@@ -11,6 +11,7 @@ from itertools import chain
 from typing import Any, Final
 
 from recon.core.errors import ReconError, SettingsError
+from recon.core.settings import Settings
 
 _GROUPS: Final = "recon."  # what the names of our entry point groups begin with
 
@@ -26,7 +27,7 @@ class Plugins:
     def check(self, given: object, ours: Collection[str] = ()) -> None:
         """Refuse an unknown name, and an object that is none, without making anything."""
         if isinstance(given, str):
-            if given not in ours and given not in (others := entry_points(group=self.group).names):
+            if given not in ours and given not in (others := self.names()):
                 choices = ", ".join(sorted({*ours, *others}))
                 what = f"unknown {self.kind}"
                 raise SettingsError(what, got=repr(given), expected=f"one of: {choices}")
@@ -38,30 +39,53 @@ class Plugins:
             what, expected = f"not usable as {self.kind}", f"a name, or {self._expected}"
             raise SettingsError(what, got=type(given).__name__, expected=expected)
 
-    def load(self, given: str | object) -> Any:
-        """Return an object as it is, and make that of a name which a package registers."""
+    def names(self) -> Collection[str]:
+        """Return the names that installed packages register, without loading anything."""
+        return entry_points(group=self.group).names
+
+    def settings_class(self, name: str) -> type[Settings] | None:
+        """Return the settings that a registered class brings as ``settings``; None = none."""
+        brought = getattr(self._load(name), "settings", None)
+        usable = inspect.isclass(brought) and issubclass(brought, Settings)
+        return brought if usable else None
+
+    def load(self, given: str | object, settings: Settings | None = None) -> Any:
+        """Return an object as it is, and make that of a name which a package registers.
+
+        A class that brings settings gets ``settings``, or their defaults where they are None.
+        """
         if not isinstance(given, str):
             return given
-        found = entry_points(group=self.group, name=given)
-        point, *others = sorted(found, key=_origin)
-        origin = f"{self.kind} {given!r} ({_origin(point)})"
-        if others:
-            raise SettingsError(
-                "two plug-ins have the same name",
-                where=f"{self.kind} {given!r}",
-                got=" and ".join(map(_origin, (point, *others))),
-                hint="uninstall one of them",
-            )
+        origin, make, own = self._origin(given), self._load(given), self.settings_class(given)
         with calling(SettingsError, "the plug-in does not load", where=origin):
-            made = point.load()()
+            made = make() if own is None else make(settings or own())
         if inspect.isclass(made) or not self._fits(made):
             raise SettingsError(
                 f"the plug-in makes no {self.kind}",
                 where=origin,
                 got=type(made).__name__,
-                expected=f"a class or function that takes no argument and gives {self._expected}",
+                expected="a class or function that takes no argument, or the settings that it "
+                f"brings, and gives {self._expected}",
             )
         return made
+
+    def _load(self, name: str) -> Any:
+        with calling(SettingsError, "the plug-in does not load", where=self._origin(name)):
+            return self._point(name).load()
+
+    def _origin(self, name: str) -> str:
+        return f"{self.kind} {name!r} ({_origin(self._point(name))})"
+
+    def _point(self, name: str) -> EntryPoint:
+        point, *others = sorted(entry_points(group=self.group, name=name), key=_origin)
+        if others:
+            raise SettingsError(
+                "two plug-ins have the same name",
+                where=f"{self.kind} {name!r}",
+                got=" and ".join(map(_origin, (point, *others))),
+                hint="uninstall one of them",
+            )
+        return point
 
     @property
     def _expected(self) -> str:

@@ -32,7 +32,7 @@ from recon.evaluation.disparity import evaluate_disparity
 from recon.io.middlebury import read_middlebury_calib, read_middlebury_scene
 from recon.stereo.frame import CloudSettings, FrameReconstructor, StereoSettings, back_project
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.sad import SadMatcher, SadSettings
+from recon.stereo.match.sad import SadMatcher
 from recon.stereo.match.search import usual_ndisp
 from recon.stereo.rectify.rectifier import Rectifier, to_grey
 
@@ -241,8 +241,8 @@ def try_patches(
         if patch_px <= min(pair.left.shape):
             matcher: Matcher = PrintedMatcher(patch_px, method == AS_PRINTED)
             if method == CORRECTED:
-                own = {**config.matching.sad.model_dump(), "window_px": patch_px}
-                matcher = SadMatcher(SadSettings.parse(own), threads)
+                own = config.matching.model_copy(update={"window_px": patch_px})
+                matcher = SadMatcher(own, threads)
             figures.append(_patch_figures(patch_px, matcher.match(pair), experiment.truth))
     return figures
 

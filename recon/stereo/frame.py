@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from pydantic import Field
+from pydantic import Field, SerializeAsAny
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
@@ -332,7 +332,7 @@ class StereoSettings(Settings):
     """Everything that determines the cloud of one frame."""
 
     rectification: RectificationSettings = RectificationSettings()
-    matching: MatchingSettings = MatchingSettings()
+    matching: SerializeAsAny[MatchingSettings] = MatchingSettings()  # with those of plug-ins
     cloud: CloudSettings = CloudSettings()
     filters: FilterSettings = FilterSettings()
     """Filters of the cloud of one frame, in this order; none turns one off. Fusion thins and cleans

@@ -174,7 +174,7 @@ def test_the_page_of_the_documentation_is_up_to_date():
 
 
 def test_settings_are_selected_by_name_and_shown_with_units_and_other_defaults():
-    assert all(name.startswith("matching.sgm.") for name in entries("matching.sgm"))
+    assert all(name.startswith("matching.opencv.") for name in entries("matching.opencv"))
     assert [*entries("grid.min_height_m")] == ["grid.min_height_m"]
     assert {"fusion.voxel_m", "filters.voxel_m"} <= {*entries("voxel")}
     printed = json.loads(settings("grid", "--json").stdout)

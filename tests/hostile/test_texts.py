@@ -86,7 +86,7 @@ def test_every_command_names_the_file(command, pair, drive):
 
 
 @pytest.mark.parametrize("number", sorted(set(NUMBERS) - {"minus 1e300", "null"}))
-@pytest.mark.parametrize("setting", ["matching.sad.window_px", "source.tolerance_s", "matching"])
+@pytest.mark.parametrize("setting", ["matching.window_px", "source.tolerance_s", "matching"])
 def test_a_hostile_value_of_a_setting_is_refused(setting, number):
     assert refusal(lambda: load_config(None, [f"{setting}={NUMBERS[number]}"]))
 
@@ -112,8 +112,8 @@ def test_every_command_names_the_option(command, pair):
         "rectify": pair,
         "calibrate": (*pair, "--board", "9x6:25mm"),
     }
-    ended = run(command, *inputs.get(command, ()), "--set", "matching.sad.window_px=!!int abc")
-    assert_refused(ended, "matching.sad.window_px")
+    ended = run(command, *inputs.get(command, ()), "--set", "matching.window_px=!!int abc")
+    assert_refused(ended, "matching.window_px")
     assert sorted(path.name for path in Path().iterdir()) == ["left.png", "right.png"]
 
 

@@ -13,6 +13,7 @@ from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
+from recon.stereo.match.search import SearchSettings
 from tests.hostile.refusals import assert_refused, run
 
 
@@ -170,7 +171,7 @@ def plugin(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("plugin")
 def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
     assert np.nanmedian(recon.match(image(), image(), matcher="flat").values) == 7
-    made = make_matcher("sad", MatchingSettings.parse({"sad": {"ndisp": 16}}))
+    made = make_matcher("sad", MatchingSettings(ndisp=16))
     assert type(made) is MATCHERS["sad"]
     with pytest.raises(SettingsError, match=r"unknown matcher.*'cencus'.*fails, fine, flat.*sad"):
         recon.match(image(), image(), matcher="cencus")
@@ -223,7 +224,8 @@ def shifted_pair(shift_px: int, shape: tuple[int, int] = (60, 160)) -> Rectified
 
 
 def match(name: str, pair: RectifiedPair, *, pad: bool = True, **settings: object) -> Disparity:
-    matcher = OpencvMatcher(OpencvSettings(pad=pad, **settings), semi_global=name == NAMES[1])
+    searched, opencv = SearchSettings.parse(settings), OpencvSettings(pad=pad)
+    matcher = OpencvMatcher(searched, opencv, semi_global=name == NAMES[1])
     return matcher.match(pair)
 
 
@@ -267,7 +269,7 @@ def test_what_opencv_could_not_match_is_nan_with_a_reason_and_tiny_images_no_err
 @pytest.mark.parametrize(
     ("name", "shape", "settings", "words"),
     [
-        ("opencv-bm", (6, 20), {"block_px": 21}, "20x6"),
+        ("opencv-bm", (6, 20), {"window_px": 21}, "20x6"),
         ("opencv-sgbm", (60, 160), {"min_disparity_px": -4096}, "exceed the range of OpenCV"),
         ("opencv-sgbm", (60, 160), {"ndisp": 4096}, "exceed the range of OpenCV"),
     ],
