@@ -280,9 +280,10 @@ def capture(
         from recon.commands.cameras import run_capture
         from recon.rig.capture import RecordingSettings
 
-        known = shared.settings().capture
-        limits = {"frames": frames, "seconds": seconds, "preview_every": preview}
-        settings = RecordingSettings.parse({**dict(known), **limits})
+        known = shared.settings()
+        own = {"frames": frames, "seconds": seconds, "preview_every": preview}
+        own["side_by_side"] = known.source.side_by_side
+        settings = RecordingSettings.parse({**dict(known.capture), **own})
         devices = [left] if right is None else [left, right]
         with until_interrupted() as stopped:
             summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -15,6 +16,7 @@ from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
 from recon.core.errors import FormatError, SettingsError
+from recon.core.renamed import current_names
 from recon.core.settings import (
     Settings,
     alternatives,
@@ -134,12 +136,16 @@ def load_config(
     Raises:
         SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
     """
-    given = merge(_nested(defaults or {}), _nested(_values_of(path)))
+    own, notes = current_names(_nested(_values_of(path)))
+    given = merge(current_names(_nested(defaults or {}))[0], own)
     values = given
     for one in [overrides] if isinstance(overrides, str | Mapping) else overrides:
         # Several settings stand in one text with commas between.
         for part in map(_parse_override, _NEXT.split(one)) if isinstance(one, str) else [one]:
-            values = merge(values, _nested(part))
+            changed, old = current_names(_nested(part))
+            values, notes = merge(values, changed), [*notes, *old]
+    if notes:
+        warnings.warn("; ".join(dict.fromkeys(notes)), FutureWarning, stacklevel=2)
     try:
         return ReconConfig.parse(values)
     except SettingsError:
@@ -170,7 +176,7 @@ def run_settings(
     if is_pair_run(folder):
         return load_config(file, overrides, PAIR_DEFAULTS)
     try:
-        own = load_config(folder / CONFIG)
+        own = ReconConfig.parse(_nested(_read_yaml(folder / CONFIG)), where=str(folder / CONFIG))
     except SettingsError as error:
         what = f"the settings of this run are not valid in this version: {error.what}"
         how = {"where": error.where, "got": error.got, "hint": "map the drive again"}

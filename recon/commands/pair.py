@@ -256,7 +256,7 @@ def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[s
         shared = taken & {*SearchSettings.model_fields}
         return {f"matching.{'' if n in shared else f'{group}.'}{n}": v for n, v in settings.items()}
     where, hint = f"matcher {name_of(matcher)!r}", "make the object with them"
-    what = "this matcher takes no settings"
+    what = "this matcher takes no settings here"
     raise SettingsError(what, where=where, got=", ".join(settings), hint=hint)
 
 

@@ -51,7 +51,7 @@ def _surface(
     cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings, image: UInt8 | None
 ) -> TriangleMesh:
     """Mesh the cloud of a pair, and colour it by the left image if that is known."""
-    if settings.pair_surface == "grid":
+    if settings.surface == "grid":
         mesh = mesh_grid(cloud, camera, settings)
     else:
         mesh = reconstruct_mesh(cloud, settings, viewpoint_m=(0.0, 0.0, 0.0))

@@ -103,7 +103,6 @@ class DriveSettings(StereoSettings):
         for name, reach_m in (
             ("map_filters.voxel_m", 2 * (filters.voxel_m or 0.0)),
             ("map_filters.radius_m", filters.radius_m or 0.0),
-            ("grid.min_blob_cells", self.grid.min_blob_cells * resolution_m),
         ):
             if reach_m > tile_m:
                 raise ValueError(

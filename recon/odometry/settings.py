@@ -18,8 +18,6 @@ class PriorSettings(Settings):
     """Axes of its poses: of the left camera (x right, y down, z forward), or of a body (x forward,
     y left, z up) that turns with it and is near to it. auto = those in which it explains what
     the cameras see on the first metres."""
-    max_gap_s: float = Field(1.0, ge=1e-06, le=1000000.0)
-    """Poses farther apart in time are not interpolated. Raise it for a slow receiver."""
     sigma_m: float = Field(0.03, ge=1e-06, le=1000000.0)
     """Standard deviation of its motion from frame to frame. State here what your sensor is worth:
     the cameras are believed where it is worse."""

@@ -26,7 +26,7 @@ from recon.core.values.arrays import UInt8, size_text
 from recon.io.images.image import write_image
 from recon.io.trajectory import FRAMES, HEADER, CapturedFrame
 from recon.sources.opencv_camera import Camera
-from recon.sources.settings import SourceSettings
+from recon.sources.settings import SideBySide, SourceSettings
 from recon.sources.video import split_views
 
 _USUAL_RATE_HZ: Final = 30.0  # assumed if a driver does not report its rate
@@ -47,16 +47,15 @@ class CaptureSettings(Settings):
     lock_exposure: bool = True
     """Lock exposure and white balance if the driver supports it. Turn it off where the light
     changes during the drive."""
-    side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = Field(
-        "left-right"
-    )
-    """Arrangement of the views in the frames of one device."""
     suffix: Literal["png", "jpg"] = "png"
     """File format: png = lossless, jpg = for a slow disk."""
 
 
 class RecordingSettings(CaptureSettings):
-    """The settings of one recording, and when it ends."""
+    """The settings of one recording, how the views of one device lie, and when it ends."""
+
+    side_by_side: SideBySide = "left-right"
+    """Arrangement of the views in the frames of one device."""
 
     frames: int | None = Field(None, ge=1, le=1_000_000_000)
     """Stop after this many pairs."""
@@ -146,7 +145,7 @@ def _grab(cameras: tuple[Camera, ...], period_s: float) -> list[float] | None:
     return None
 
 
-def _retrieve(cameras: tuple[Camera, ...], settings: CaptureSettings) -> tuple[UInt8, UInt8]:
+def _retrieve(cameras: tuple[Camera, ...], settings: RecordingSettings) -> tuple[UInt8, UInt8]:
     images = [camera.retrieve() for camera in cameras]
     if len(images) == 1:
         stacked = settings.side_by_side in {"top-bottom", "bottom-top"}

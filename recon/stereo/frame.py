@@ -6,16 +6,18 @@ Points have their uncertainties; flying edges and outliers are left out.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
 import cv2
 import numpy as np
-from pydantic import Field, SerializeAsAny
+from pydantic import Field, SerializeAsAny, model_validator
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
+from recon.core.renamed import current_names
 from recon.core.settings import Length, Settings
 from recon.core.values import (
     Disparity,
@@ -179,8 +181,6 @@ class CloudSettings(Settings):
     inferred: bool = False
     """Points also of pixels whose disparity is not measured, but that of planes around them; they
     are marked. Turn it on where a surface without holes counts more than a true one."""
-    stride: int = Field(1, ge=1, le=16)
-    """Every n-th row and column is used. Raise it for speed with large images."""
 
 
 def back_project(
@@ -235,7 +235,7 @@ def _rules(camera: RectifiedCamera, settings: CloudSettings, normals: bool) -> p
         nearest=settings.min_range_m,
         farthest=_or_infinity(settings.max_range_m),
         relative_sigma=_or_infinity(settings.max_relative_sigma),
-        stride=settings.stride,
+        stride=1,
         radius=_NORMALS_RADIUS_PX if normals else 0,
     )
 
@@ -337,6 +337,11 @@ class StereoSettings(Settings):
     filters: FilterSettings = FilterSettings()
     """Filters of the cloud of one frame, in this order; none turns one off. Fusion thins and cleans
     the clouds of a drive anyway."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_old_names(cls, values: Any) -> Any:
+        return current_names(values)[0] if isinstance(values, Mapping) else values
 
     def with_matcher(self, matcher: str | Matcher | None) -> Self:
         """Return the settings with another matcher, by name or as an object; None = unchanged.

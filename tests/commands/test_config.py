@@ -103,11 +103,11 @@ def test_the_groups_of_every_command_are_settings(command):
 
 
 def test_an_override_wins_for_its_key_and_the_file_is_not_blamed_for_a_wrong_one(tmp_path):
-    (tmp_path / "c.yaml").write_text("mesh: {max_depth: 8}\nmatching: {window_px: 7}\n")
+    (tmp_path / "c.yaml").write_text("mesh: {depth: 8}\nmatching: {window_px: 7}\n")
     changes = ["matching.window_px=9", "fusion.min_count=2", "fusion.min_count=5"]
     config = load_config(f"{tmp_path}/c.yaml", [*changes, "fusion.voxel_m=0.2"], PAIR_DEFAULTS)
     assert config.matching.window_px == 9
-    assert (config.fusion.min_count, config.fusion.voxel_m, config.mesh.max_depth) == (5, 0.2, 8)
+    assert (config.fusion.min_count, config.fusion.voxel_m, config.mesh.depth) == (5, 0.2, 8)
     assert config.cloud.max_range_m is None
     (tmp_path / "c.yaml").write_text("")
     assert load_config(tmp_path / "c.yaml") == ReconConfig()

@@ -102,7 +102,7 @@ def test_focal_length_and_baseline_give_metres_and_a_principal_point_is_that_of_
 
 def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(images, tmp_path):
     given = read(images, SourceSettings(focal_px=300))
-    settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+    settings = load_config(None, ["mesh.depth=5"], PAIR_DEFAULTS)
     run = run_pair(given, settings, out=tmp_path / "out")
     assert run.summary["up_to_scale"] is True
     assert run.summary["depth_median_m"] == pytest.approx(300 / 12, rel=0.01)  # in baselines

@@ -199,9 +199,9 @@ def written(store, folder, settings=SETTINGS, threads=None):
     return read_mesh(folder / "mesh" / "mesh.ply"), tiles, list(found.warnings)
 
 
-@pytest.mark.parametrize("way", ["voxels", "poisson"])
+@pytest.mark.parametrize("way", ["grid", "poisson"])
 def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(store, tmp_path, way):
-    settings = SETTINGS.model_copy(update={"map_surface": way})
+    settings = SETTINGS.model_copy(update={"surface": way})
     whole, tiles, warnings = written(store, tmp_path / "alone", settings, threads=1)
     assert (warnings, len(tiles)) == ([], 2)
     assert sum(len(tile.faces) for tile in tiles) == len(whole.faces)
@@ -307,7 +307,7 @@ def test_tiles_with_too_few_points_are_reported_and_none_is_an_error(store, tmp_
     stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
     cloud = street().select(np.arange(3))
     put_cloud(store, PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
-    coarse = SETTINGS.model_copy(update={"max_depth": 5})
+    coarse = SETTINGS.model_copy(update={"depth": 5})
     warnings = written(store, tmp_path / "few", coarse)[2]
     assert len(warnings) == 1
     assert warnings[0].startswith("no surface in 2 of 4 tiles, 0.0% of the points (too few points")

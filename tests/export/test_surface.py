@@ -12,6 +12,7 @@ from recon.core.errors import MeshingError
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.camera import project
+from recon.export.mesh import poisson as poisson_file
 from recon.export.mesh.coverage import mesh_coverage
 from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.poisson import MeshSettings, _fitting_depth, reconstruct_mesh
@@ -117,12 +118,13 @@ def test_clouds_without_a_surface_are_refused(xyz, complaint):
         reconstruct_mesh(PointCloud(xyz.astype(np.float32)), MeshSettings())
 
 
-def test_the_depth_follows_the_spacing_of_the_points():
+def test_the_depth_follows_the_spacing_of_the_points(monkeypatch):
     coarse, fine = sphere(1000), sphere(16000)  # spacings differ by four: two levels
-    chosen = [_fitting_depth(cloud.xyz, MeshSettings()) for cloud in (coarse, fine)]
+    chosen = [_fitting_depth(cloud.xyz) for cloud in (coarse, fine)]
     assert chosen[1] - chosen[0] == 2
-    assert _fitting_depth(fine.xyz, MeshSettings(max_depth=4)) == 4
-    assert _fitting_depth((100 * fine.xyz).astype(np.float32), MeshSettings()) == chosen[1]
+    assert _fitting_depth((100 * fine.xyz).astype(np.float32)) == chosen[1]
+    monkeypatch.setattr(poisson_file, "_MAX_DEPTH", 4)
+    assert _fitting_depth(fine.xyz) == 4
 
 
 def test_points_of_one_plane_and_those_that_are_not_finite_give_their_surface():

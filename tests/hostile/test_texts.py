@@ -242,9 +242,7 @@ def test_a_setting_at_its_bound_gives_a_map_or_one_line(number, end, street, tmp
     assert "\n" not in line
 
 
-@pytest.mark.parametrize(
-    "setting", ["map_filters.voxel_m=26", "map_filters.radius_m=51", "grid.min_blob_cells=251"]
-)
+@pytest.mark.parametrize("setting", ["map_filters.voxel_m=26", "map_filters.radius_m=51"])
 def test_margins_beyond_a_tile_are_refused(setting):
     name = setting.partition("=")[0]
     with pytest.raises(SettingsError, match=f"{name} reaches 5.* m, beyond a tile of 50 m"):

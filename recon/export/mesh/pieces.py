@@ -211,7 +211,7 @@ class _Mesher:
         else:
             settings = settings.model_copy(update={"min_component_faces": 1})
         try:
-            if settings.map_surface == "voxels":
+            if settings.surface == "grid":
                 voxel_m = self.tiles.config.fusion.voxel_m
                 mesh = reconstruct_map_surface(cloud, settings, voxel_m, wrong)
             else:

@@ -96,7 +96,9 @@ class OnnxNetwork:
                 options.terminate = True
         if late:
             what, got = "the network does not come to an end", f"{self._limit_s:g} s"
-            hint = "--set matching.onnx.time_limit_s= allows more"
+            hint = (
+                "give it smaller images: matching.onnx.width_px and height_px, or tile_megapixels"
+            )
             raise MatchingError(what, where=self._path, got=got, hint=hint)
         return list(running.result())
 

@@ -25,6 +25,7 @@ from recon.stereo.match.self_test import check_network
 from recon.stereo.match.tiles import match_in_tiles
 
 _WHITE: Final = 255.0
+_TIME_LIMIT_S: Final = 600.0  # of an image or tile: one that never ends is refused
 Size = tuple[int, int]  # width and height
 
 
@@ -62,8 +63,6 @@ class OnnxSettings(Settings):
     tile_megapixels: float = Field(1.0, ge=0.1, le=1000)
     """Larger images are matched in tiles of this size, which overlap; memory grows with it, by 1 to
     2 GB per megapixel of a small network. Not where the network or width_px gives the size."""
-    time_limit_s: float = Field(600.0, ge=0.1, le=1e6)
-    """The longest that the network may take of an image or tile: one that never ends is refused."""
     self_test: bool = True
     """Let the network match a rendered plane first, and refuse it if it does not find the
     disparity."""
@@ -137,7 +136,7 @@ class OnnxMatcher:
                 get = f": {self._use.get}" if self._use.get else ""
                 what, hint = "the matcher 'onnx' needs a network", "--set matching.onnx.model=FILE"
                 raise SettingsError(what, expected=f"a file{get}", hint=hint)
-            network = OnnxNetwork(path, self._threads, s.time_limit_s)
+            network = OnnxNetwork(path, self._threads, _TIME_LIMIT_S)
             if self._use.layout not in {"", network.layout}:
                 what, hint = f"not the network of the preset {s.preset!r}", f"get {self._use.get}"
                 how = {"got": network.layout, "expected": self._use.layout, "hint": hint}

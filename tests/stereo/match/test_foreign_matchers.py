@@ -126,7 +126,7 @@ def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named():
     [
         (Flat, {}, r"class.*Flat\(\)"),
         (7, {}, "not usable as matcher.*int"),
-        (Flat(), {"ndisp": 16}, r"only recon's own matchers take settings.*ndisp"),
+        (Flat(), {"ndisp": 16}, r"takes no settings here.*ndisp"),
     ],
 )
 def test_what_is_no_matcher_or_takes_no_settings_is_refused(given, settings, word):
