@@ -98,6 +98,14 @@ def settings(
             show_default="all",
         ),
     ] = None,
+    preset: Annotated[
+        str | None,
+        opt.option(
+            "Print a preset, as a file for --config: fast, robot, survey, room or small.",
+            "--preset",
+            metavar="PRESET",
+        ),
+    ] = None,
     markdown: Annotated[bool, opt.option("Print the page docs/settings.md.", "--markdown")] = False,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
@@ -109,13 +117,19 @@ def settings(
     Examples:
       recon settings matching.onnx
       recon settings voxel
+      recon settings --preset robot > robot.yaml
     """
     with one_line_errors(quiet=quiet):
         from dataclasses import asdict
 
         from recon.commands.config import list_settings, settings_page
+        from recon.commands.presets import preset_text, preset_values
 
+        text = None if preset is None else preset_text(preset)
         groups = list_settings(name)
+    if text is not None:
+        print_json(dict(preset_values(preset))) if json else typer.echo(text, nl=False)
+        return
     if json:
         print_json({"groups": [asdict(group) for group in groups]})
     elif markdown:

@@ -15,6 +15,7 @@ from pydantic import model_validator
 from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
+from recon.commands.presets import preset_values
 from recon.core.errors import FormatError, SettingsError
 from recon.core.renamed import current_names
 from recon.core.settings import (
@@ -51,6 +52,8 @@ _BYTES_PER_PIXEL: Final = 18
 class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfig):
     """Everything that determines a result; written beside each result as ``config.yaml``."""
 
+    preset: str | None = None
+    """What the others began with: a name in ``presets.yaml``."""
     source: SourceSettings = SourceSettings()
     capture: CaptureSettings = CaptureSettings()
     mesh: MeshSettings = MeshSettings()
@@ -84,7 +87,7 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
             groups["matching"] = {k: v for k, v in groups["matching"].items() if k in kept}
         if self.street == usual[0].street:
             groups.pop("street", None)
-        return groups
+        return groups if self.preset is None else {"preset": self.preset, **groups}
 
 
 _FRAME: Final = ("source", "rectification", "matching", "cloud", "filters")
@@ -121,8 +124,10 @@ def load_config(
     path: StrPath | Mapping[str, Any] | ReconConfig | None = None,
     overrides: Changes | Mapping[str, Any] = (),
     defaults: Mapping[str, Any] | None = None,
+    *,
+    preset: str | None = None,
 ) -> ReconConfig:
-    """Build the configuration; what comes later wins: defaults, file, overrides.
+    """Build the configuration; what comes later wins: defaults, preset, file, overrides.
 
     Keys of all mappings may be dotted or nested.
 
@@ -132,17 +137,24 @@ def load_config(
         overrides: ``key=value`` texts with dotted keys, such as ``matching.window_px=9``,
             also several with commas; or mappings; or one of them.
         defaults: Defaults of a command that differ from those of the stages.
+        preset: Name of settings that are chosen together: fast, robot, survey, room or small; None
+            = that which the file names, if any.
 
     Raises:
         SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
     """
     own, notes = current_names(_nested(_values_of(path)))
-    given = merge(current_names(_nested(defaults or {}))[0], own)
-    values = given
+    named = own.get("preset") if preset is None else preset
+    chosen = {} if named is None else {"preset": named}
+    usual = merge(current_names(_nested(defaults or {}))[0], preset_values(named))
+    values = given = merge(merge(usual, own), chosen)
     for one in [overrides] if isinstance(overrides, str | Mapping) else overrides:
         # Several settings stand in one text with commas between.
         for part in map(_parse_override, _NEXT.split(one)) if isinstance(one, str) else [one]:
             changed, old = current_names(_nested(part))
+            if "preset" in changed:
+                hint = "--preset NAME, or recon.load_config(preset=NAME)"
+                raise SettingsError("a preset is not one of the settings", got=part, hint=hint)
             values, notes = merge(values, changed), [*notes, *old]
     if notes:
         warnings.warn("; ".join(dict.fromkeys(notes)), FutureWarning, stacklevel=2)
@@ -166,28 +178,40 @@ def _values_of(path: object) -> Mapping[str, Any]:
 
 
 def run_settings(
-    folder: Path, file: Path | None = None, overrides: Changes = (), without: Collection[str] = ()
+    folder: Path,
+    file: Path | None = None,
+    overrides: Changes = (),
+    without: Collection[str] = (),
+    *,
+    preset: str | None = None,
 ) -> ReconConfig:
     """Return the settings of a finished run of map, demo or pair, with changes.
 
-    The file comes before the overrides. The sections ``without`` are the defaults again, since
-    they are of its source.
+    The preset comes before the file, and that before the overrides. The sections ``without`` are
+    the defaults again, since they are of its source.
     """
     if is_pair_run(folder):
-        return load_config(file, overrides, PAIR_DEFAULTS)
+        return load_config(file, overrides, PAIR_DEFAULTS, preset=preset)
     try:
         own = ReconConfig.parse(_nested(_read_yaml(folder / CONFIG)), where=str(folder / CONFIG))
     except SettingsError as error:
         what = f"the settings of this run are not valid in this version: {error.what}"
         how = {"where": error.where, "got": error.got, "hint": "map the drive again"}
         raise SettingsError(what, **how) from error
-    return load_config(file, overrides, own.model_dump(mode="json", exclude=set(without)))
+    known = own.model_dump(mode="json", exclude={*without, "preset"})
+    return load_config(file, overrides, known, preset=preset)
 
 
 def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[str]) -> None:
-    """Refuse settings that differ from those that a run had, but for those of some sections."""
-    for name in type(config).model_fields:
-        if name not in sections and getattr(config, name) != getattr(ran, name):
+    """Refuse settings that differ from those that a run had, but for those of some sections.
+
+    What a preset says of the others is no wish: the preset is for more than these sections.
+    """
+    own = ran.model_dump(mode="json", exclude={"preset"})
+    usual = ran if config.preset is None else load_config(None, (), own, preset=config.preset)
+    for name in {*type(config).model_fields} - {*sections, "preset"}:
+        value = getattr(config, name)
+        if value not in (getattr(ran, name), getattr(usual, name)):
             what = "this setting has no effect here: the drive is not mapped again"
             expected = f"settings of {', '.join(sections)}"
             raise SettingsError(what, got=name, expected=expected, hint="recon map takes it")
@@ -345,7 +369,7 @@ def _groups(
             unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
             values = (_as_yaml(value), _as_yaml(paired), unit, _values(field))
             own.append(SettingEntry(name, *values, text, follows_scene(field)))
-    if own:
+    if own and prefix:  # not the name of a preset
         about = purpose or (type(drive).__doc__ or "").partition("\n")[0].replace("``", "`")
         yield SettingGroup(prefix.removesuffix("."), about, tuple(own))
     for group in inside:

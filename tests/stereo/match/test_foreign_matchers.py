@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import recon
+from recon.commands.config import list_settings, load_config
 from recon.core.errors import MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.io.middlebury import stand_in_camera
@@ -208,6 +209,65 @@ def test_a_command_whose_plugin_exits_with_0_fails(name, tmp_path):
     ended = run("disparity", *images, "--matcher", name, "--out", tmp_path / "out")
     assert_refused(ended, f"matcher '{name}'", "SystemExit: 0")
     assert not (tmp_path / "out").exists()
+
+
+SET = """
+import numpy as np
+from pydantic import Field
+from recon import Disparity
+from recon.core.settings import Settings
+
+class LevelSettings(Settings):
+    \"\"\"How a level is guessed.\"\"\"
+
+    level_px: float = Field(7.0, ge=0.0, le=100.0)
+    \"\"\"Disparity of every pixel.\"\"\"
+
+class Level:
+    settings = LevelSettings
+
+    def __init__(self, settings):
+        self.level_px = settings.level_px
+
+    def match(self, pair):
+        return Disparity.from_values(np.full(pair.left.shape, self.level_px))
+"""
+
+
+@pytest.fixture
+def with_settings(tmp_path, monkeypatch):
+    points = {"my-level": "level_matcher:Level"}
+    install_plugin(tmp_path, "level-matcher", {"level_matcher.py": SET}, points)
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+
+@pytest.mark.usefixtures("with_settings")
+def test_the_settings_that_a_plugin_brings_are_checked_shown_recorded_and_handed_to_it(tmp_path):
+    changes = ["matching.matcher=my-level", "matching.my_level.level_px=3"]
+    config = load_config(None, changes)
+    found = make_matcher("my-level", config.matching).match(shifted_pair(0))
+    assert np.nanmax(found.values) == 3
+    assert np.nanmedian(recon.match(image(), image(), matcher="my-level").values) == 7
+    assert np.nanmedian(recon.match(image(), image(), matcher="my-level", level_px=2).values) == 2
+    own = {"my_level": {"level_px": 3.0}}
+    assert config.recorded("pair")["matching"] == {"matcher": "my-level", **own}
+    assert load_config(config.model_dump(mode="json")) == config
+    assert load_config(config, {"matching.window_px": 9}).matching.my_level.level_px == 3
+    for wrong, words in (("level_px=-1", "greater than or equal"), ("levels=1", "unknown setting")):
+        with pytest.raises(
+            SettingsError, match=rf"matching\.my_level\.{wrong[:5]}.*{words}|{words}"
+        ):
+            load_config(None, [f"matching.my_level.{wrong}"])
+    (group,) = list_settings("matching.my_level")
+    assert (group.name, group.purpose) == ("matching.my_level", "How a level is guessed.")
+    assert [(one.name, one.default) for one in group.settings] == [
+        ("matching.my_level.level_px", "7")
+    ]
+
+
+def test_settings_of_a_matcher_that_is_not_installed_are_refused_by_name():
+    with pytest.raises(SettingsError, match=r"unknown setting 'matching\.my_level'"):
+        load_config(None, ["matching.my_level.level_px=3"])
 
 
 NAMES = ("opencv-bm", "opencv-sgbm")
