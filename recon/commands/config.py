@@ -221,7 +221,7 @@ def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:
     """Return plain values, without what is open here and in the usual settings."""
     plain = settings.model_dump(mode="json")
     for name in type(settings).model_fields:
-        value, others = getattr(settings, name), [getattr(other, name) for other in usual]
+        value, others = getattr(settings, name), [getattr(one, name, None) for one in usual]
         if isinstance(value, Settings):
             plain[name] = _recorded(value, others)
         if plain[name] == {} or (value is None and all(other is None for other in others)):
