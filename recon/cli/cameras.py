@@ -239,11 +239,11 @@ def audit(
         typer.echo(f"results: {out}")
 
 
-def _size(text: str) -> dict[str, str]:
+def _size(text: str) -> dict[str, list[str]]:
     width, _, height = text.partition("x")
     if not (is_count(width) and is_count(height)):
         raise SettingsError("cannot read this size", got=text, expected="WIDTHxHEIGHT: 1280x720")
-    return {"capture.width_px": width, "capture.height_px": height}
+    return {"capture.size_px": [width, height]}
 
 
 @opt.takes_groups

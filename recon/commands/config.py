@@ -26,7 +26,6 @@ from recon.core.settings import (
     merge,
     suggest_names,
 )
-from recon.evaluation.paper import PaperConfig
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings
 from recon.io.fields import parse_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
@@ -49,7 +48,7 @@ _BYTES_PER_PIXEL: Final = 18
 """Two colour images, and the disparity with its confidence and deviation: the least of a pair."""
 
 
-class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfig):
+class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings):
     """Everything that determines a result; written beside each result as ``config.yaml``."""
 
     preset: str | None = None
@@ -107,7 +106,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "calibrate": ("source", "rectification", "calibration"),
     "audit": ("source", "rectification", "matching", "audit"),
     "evaluate-middlebury": ("rectification", "matching"),
-    "paper": (*_FRAME, "mesh", "paper"),
+    "paper": (*_FRAME, "mesh"),
 }
 """The groups of settings that determine the result of each command."""
 

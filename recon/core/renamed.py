@@ -6,10 +6,11 @@ has the value of that constant, and refused else.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 from recon.core.errors import SettingsError
+from recon.core.settings import merge
 
 
 class Renamed(NamedTuple):
@@ -50,49 +51,72 @@ CONSTANTS: Final[dict[str, Any]] = {
     "grid.min_blob_cells": 3,
     "mesh.cell_spacings": 1.5,
     "mesh.max_depth": 10,
+    "mesh.trim_density_quantile": 0.01,
+    "mesh.free_space": True,
+    "paper.as_printed": False,
+    "paper.patches_px": [*range(3, 22, 2)],
     "street.baseline_m": 0.54,
     "street.pitch_deg": 1.0,
 }
+JOINED: Final = {
+    f"{group}.size_px": (f"{group}.width_px", f"{group}.height_px")
+    for group in ("matching.onnx", "capture")
+}
+"""New settings, each of two values, of which each was one."""
 _IN_A_ROOM: Final[dict[str, Any]] = {"street.baseline_m": 0.12, "street.pitch_deg": 8.0}
 _SINCE: Final = "1.0"
+_NOTES: Final = {
+    **{name: f"{name} is {new.to} since {_SINCE}" for name, new in RENAMED.items()},
+    **{n: f"{n} is a part of {to} since {_SINCE}" for to, names in JOINED.items() for n in names},
+    **{name: f"{name} is a constant since {_SINCE}: remove it" for name in CONSTANTS},
+}
 
 
 def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Return nested values of settings under the names of today, and what to say of old ones.
 
     Raises:
-        SettingsError: A constant of today has another value, or old names of one setting differ.
+        SettingsError: A constant of today has another value, or names of one setting differ.
     """
-    found = {name: value for name in (*RENAMED, *CONSTANTS) if (value := _at(values, name)) != ...}
+    found = {name: value for name in _NOTES if (value := _at(values, name)) is not ...}
     if not found:
         return dict(values), []
+    constants = {**CONSTANTS, **(_IN_A_ROOM if _at(values, "street.path") == "room" else {})}
+    for name in found.keys() & constants.keys():
+        if not _same(found[name], constants[name]):
+            raise SettingsError(
+                f"setting {name!r} is a constant since {_SINCE}",
+                got=found[name],
+                expected=constants[name],
+                hint="remove it, or use an earlier version",
+            )
+    kept = _without(values, found)
     scale = _at(values, "scene.scale")
-    scale = scale if isinstance(scale, int | float) else 1.0
-    kept, notes, moved = _without(values, found), list[str](), dict[str, tuple[str, Any]]()
-    for name, value in found.items():
-        if name in CONSTANTS:
-            in_a_room = _at(values, "street.path") == "room"
-            _check_constant(name, value, {**CONSTANTS, **(_IN_A_ROOM if in_a_room else {})}[name])
-            notes.append(f"{name} is a constant since {_SINCE}: remove it")
-            continue
-        new = RENAMED[name]
-        notes.append(f"{name} is {new.to} since {_SINCE}")
+    for to, name, value in _moved(found, scale if isinstance(scale, int | float) else 1.0):
+        given = _at(kept, to)
+        if given is not ... and not _same(value, given):
+            raise SettingsError(
+                f"{name} is {to} since {_SINCE}, which has another value here",
+                got=f"{value} and {given}",
+                hint=f"give {to} alone",
+            )
+        inner: Any = value
+        for part in reversed(to.split(".")):
+            inner = {part: inner}
+        kept = merge(kept, inner)
+    return kept, [_NOTES[name] for name in found]
+
+
+def _moved(found: Mapping[str, Any], scale: float) -> Iterator[tuple[str, str, Any]]:
+    """Yield new name, old name and value of what is not as it is by default."""
+    for name, new in RENAMED.items():
         default = scale * new.default if new.length else new.default
-        if default is ... or not _same(value, default):
-            meant = new.values.get(str(value), value)
-            moved.setdefault(new.to, (name, meant))
-            given = _at(kept, new.to)
-            first, other = moved[new.to] if given is ... else (new.to, given)
-            if not _same(meant, other):
-                raise SettingsError(
-                    f"{name} and {first} are one setting since {_SINCE}, and differ",
-                    got=f"{meant} and {other}",
-                    hint=f"give {new.to} alone",
-                )
-    for to, (_, value) in moved.items():
-        group, _, name = to.rpartition(".")
-        kept[group] = {**kept.get(group, {}), name: value}
-    return kept, notes
+        if name in found and (default is ... or not _same(found[name], default)):
+            yield new.to, name, new.values.get(str(found[name]), found[name])
+    for to, names in JOINED.items():
+        parts = [found.get(name) for name in names]
+        if set(parts) - {None, "none"}:
+            yield to, names[0], parts
 
 
 def _at(values: Any, name: str) -> Any:
@@ -115,16 +139,6 @@ def _without(values: Mapping[str, Any], names: Mapping[str, Any], prefix: str = 
         if inner != {} or value == {}:
             kept[key] = inner
     return kept
-
-
-def _check_constant(name: str, value: Any, constant: Any) -> None:
-    if not _same(value, constant):
-        raise SettingsError(
-            f"setting {name!r} is a constant since {_SINCE}",
-            got=value,
-            expected=constant,
-            hint="remove it, or use an earlier version",
-        )
 
 
 def _same(value: Any, other: Any) -> bool:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -35,13 +35,14 @@ _WAITING: Final = 32  # pairs to be written; more would only hide that the disk 
 _GAP_PERIODS: Final = 1.5  # a longer time step means that a frame was lost
 
 
+_Length = Annotated[int, Field(ge=16, le=100000)]
+
+
 class CaptureSettings(Settings):
     """Settings of a recording."""
 
-    width_px: int | None = Field(None, ge=16, le=100000)
-    """Requested frame width. none = the driver's default."""
-    height_px: int | None = Field(None, ge=16, le=100000)
-    """Requested frame height; with width_px."""
+    size_px: tuple[_Length, _Length] | None = None
+    """Requested width and height of frames. none = the driver's default."""
     rate_hz: float | None = Field(None, ge=0.001, le=1000000.0)
     """Requested frame rate. none = the driver's default."""
     lock_exposure: bool = True
@@ -81,12 +82,10 @@ def open_cameras(devices: Iterable[str], settings: CaptureSettings) -> Iterator[
 
     ``devices`` are numbers, paths, addresses of streams, or video files.
     """
-    width, height = settings.width_px, settings.height_px
-    size = None if width is None or height is None else (width, height)
     with ExitStack() as stack:
         cameras: list[Camera] = []
         for device in devices:
-            cameras.append(Camera(device, size, settings.rate_hz))
+            cameras.append(Camera(device, settings.size_px, settings.rate_hz))
             stack.callback(cameras[-1].close)
         yield tuple(cameras)
 

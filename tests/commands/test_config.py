@@ -24,7 +24,7 @@ from recon.run.directory import STARTED, state_folder
         ("pair", PAIR_DEFAULTS, ["filters.statistical_neighbours=none", "filters.voxel_m=0.1"]),
         ("pair", PAIR_DEFAULTS, ["matching.matcher=onnx", "matching.onnx.model=a.onnx"]),
         ("calibrate", {}, ["calibration.model=fisheye", "calibration.working_m=3"]),
-        ("paper", PAIR_DEFAULTS, ["paper.as_printed=true"]),
+        ("paper", PAIR_DEFAULTS, ["matching.window_px=9"]),
     ],
 )
 def test_a_dumped_configuration_loads_back_equal(tmp_path, command, defaults, overrides):

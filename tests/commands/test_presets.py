@@ -1,6 +1,7 @@
 """Presets, and settings whose names are others now."""
 
 import warnings
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import recon
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.commands.presets import preset_text
 from recon.core.errors import SettingsError
-from recon.core.renamed import CONSTANTS, RENAMED, current_names
+from recon.core.renamed import CONSTANTS, JOINED, RENAMED, current_names
 from recon.core.settings import setting_names
 from recon.io.fields import write_yaml
 from recon.map.settings import DriveSettings
@@ -64,6 +65,8 @@ OLD: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "a reach in a room": ({"scene.scale": 0.2, "ground.reach_m": 5.0}, {"scene.scale": 0.2}),
     "a reach": ({"ground.reach_m": 30.0}, {"occupancy.max_range_m": 30.0}),
     "a constant": ({"grid.min_blob_cells": 3, "mesh.max_depth": 10}, {}),
+    "a size": ({"capture": {"width_px": 640, "height_px": 480}}, {"capture.size_px": [640, 480]}),
+    "no size": ({"matching.onnx": {"width_px": None, "height_px": None}}, {}),
     "a rig in a room": (
         {"street": {"path": "room", "baseline_m": 0.12, "pitch_deg": 8.0}}, {"street.path": "room"},
     ),
@@ -81,9 +84,9 @@ def test_old_names_are_read_with_one_line_that_names_the_new_ones(case):
 
 @pytest.mark.parametrize(("given", "words"), [
     ({"matching.sgm.p1": 20}, r"sgm\.p1' is a constant since 1\.0 \(got 20, expected 16"),
-    ({"matching.sad.ndisp": 64, "matching.ndisp": 32}, r"are one setting since.*64 and 32"),
-    ({"matching.sad.fill": False, "matching.fine.fill": True}, r"one setting.*ing\.fill alone"),
-    ({"ground.reach_m": 30, "occupancy.max_range_m": 25}, r"reach_m and occupancy\.max_range_m"),
+    ({"matching.sad.ndisp": 64, "matching.ndisp": 32}, r"since 1.*another value here \(got 64 and 32"),
+    ({"matching.sad.fill": False, "matching.fine.fill": True}, r"another value.*ing\.fill alone"),
+    ({"ground.reach_m": 30, "occupancy.max_range_m": 25}, r"reach_m is occupancy\.max_range_m"),
 ])  # fmt: skip
 def test_old_values_that_there_are_no_more_are_refused_in_one_line(given, words):
     with pytest.raises(SettingsError, match=words) as refused:
@@ -93,8 +96,8 @@ def test_old_values_that_there_are_no_more_are_refused_in_one_line(given, words)
 
 def test_every_new_name_is_one_and_no_old_name_is():
     names = {*setting_names(ReconConfig)}
-    assert {one.to for one in RENAMED.values()} <= names
-    assert not {*RENAMED, *CONSTANTS} & names
+    assert {one.to for one in RENAMED.values()} | {*JOINED} <= names
+    assert not {*RENAMED, *CONSTANTS, *chain(*JOINED.values())} & names
 
 
 def test_the_settings_that_an_old_map_keeps_are_read_without_a_word():

@@ -43,7 +43,12 @@ def boundary_edges(mesh: TriangleMesh, most: int | None = None) -> int:
     return int((count == 1 if most is None else count > most).sum())
 
 
-WHOLE = MeshSettings(depth=5, trim_density_quantile=0)
+@pytest.fixture(autouse=True)
+def untrimmed(monkeypatch):
+    monkeypatch.setattr(poisson_file, "_LEAST_SUPPORTED", 0.0)
+
+
+WHOLE = MeshSettings(depth=5)
 
 
 def test_the_mesh_of_a_sphere_lies_on_it_is_closed_faces_out_and_has_its_colours():
@@ -91,7 +96,7 @@ def test_the_same_cloud_gives_the_same_mesh_and_nothing_else_is_touched(capfd):
 @pytest.mark.parametrize("viewpoint_m", [None, (3.0, 0.0, 5.0)])
 def test_a_cloud_without_normals_gets_them(viewpoint_m):
     cloud = PointCloud(sphere(1000).xyz)
-    mesh = reconstruct_mesh(cloud, MeshSettings(depth=4, trim_density_quantile=0), viewpoint_m)
+    mesh = reconstruct_mesh(cloud, MeshSettings(depth=4), viewpoint_m)
     assert np.abs(radii(mesh) - 1).max() < 0.02
     along = np.einsum("ij,ij->i", mesh.normals, mesh.vertices - np.float32([3, 0, 5]))
     assert (np.abs(along) > 0.9).all()

@@ -30,6 +30,7 @@ _FARTHEST = 1000.0  # distance of a point from the middle, as a multiple of thei
 _SPACING_NEIGHBOURS = 7
 _SPACING_SAMPLES = 20_000
 _OCTREE_SCALE = 1.1  # MeshLab's octree is this much wider than the cloud
+_LEAST_SUPPORTED: Final = 0.01  # of the vertices, which are cut off: bulges beyond the points
 _CELL_SPACINGS: Final = 1.5  # widest octree cell: noise becomes ripples in smaller ones
 _MAX_DEPTH: Final = 10  # that is chosen by the points: bounds time and memory
 Point = tuple[float, float, float]
@@ -51,8 +52,6 @@ class MeshSettings(Settings):
     the cells, and takes four times the memory."""
     point_weight: float = Field(4.0, ge=0, le=1000.0)
     """Weight of the points against their normals. Lower is smoother."""
-    trim_density_quantile: float = Field(0.01, ge=0, lt=1)
-    """Share of the vertices cut off as least supported; 0 keeps all."""
     max_distance_spacings: float | None = Field(2.0, ge=0.01, le=1000000.0)
     """Farthest a vertex may lie from the points, in local point spacings; none = keep all. Lower it
     to keep holes open."""
@@ -67,9 +66,6 @@ class MeshSettings(Settings):
     texture_px: int = Field(8192, ge=64, le=16384)
     """Largest width and height of the picture of a textured map: what graphics cards take. Its
     texels are as wide as the pixels that saw the surface, wider where that is more."""
-    free_space: bool = True
-    """Remove surfaces in space that the cameras of a drive saw to be free. Off keeps what moved
-    through."""
 
     @model_validator(mode="after")
     def _check_solid(self) -> Self:
@@ -116,7 +112,7 @@ def reconstruct_mesh(
     vertices, faces, density = screened_poisson(
         cloud.xyz, normals, depth, _OCTREE_SCALE, settings.point_weight
     )
-    supported = density >= np.quantile(density, settings.trim_density_quantile)
+    supported = density >= np.quantile(density, _LEAST_SUPPORTED)
     if settings.max_distance_spacings is not None:
         supported &= _near_data(vertices, cloud.xyz, settings.max_distance_spacings)
     return trimmed(keep_vertices(vertices, faces, supported), cloud, settings, wrong)

@@ -66,7 +66,7 @@ def test_the_network_decides_the_disparity(difference):
     scaled = match(difference, pair_of(10, 15), mean=(0.2,), std=(0.5 / 255,), output_scale=-1.0)
     assert np.nanmedian(scaled.values) == pytest.approx(10, abs=1e-3)
     # 8 pixels of an image half as wide are 16 of the image.
-    half = match(difference, pair_of(18, 10), std=(1 / 255,), width_px=30, height_px=20)
+    half = match(difference, pair_of(18, 10), std=(1 / 255,), size_px=(30, 20))
     assert np.nanmedian(half.values) == pytest.approx(16)
 
 
