@@ -84,7 +84,7 @@ def test_old_names_are_read_with_one_line_that_names_the_new_ones(case):
 
 @pytest.mark.parametrize(("given", "words"), [
     ({"matching.sgm.p1": 20}, r"sgm\.p1' is a constant since 1\.0 \(got 20, expected 16"),
-    ({"matching.sad.ndisp": 64, "matching.ndisp": 32}, r"since 1.*another value here \(got 64 and 32"),
+    ({"matching.sad.ndisp": 64, "matching.ndisp": 32}, r"another value here \(got 64 and 32"),
     ({"matching.sad.fill": False, "matching.fine.fill": True}, r"another value.*ing\.fill alone"),
     ({"ground.reach_m": 30, "occupancy.max_range_m": 25}, r"reach_m is occupancy\.max_range_m"),
 ])  # fmt: skip
