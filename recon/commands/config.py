@@ -15,7 +15,7 @@ from pydantic import model_validator
 from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
-from recon.commands.presets import preset_values
+from recon.commands.presets import preset_values, presets_text
 from recon.core.errors import FormatError, SettingsError
 from recon.core.renamed import current_names
 from recon.core.settings import (
@@ -342,6 +342,7 @@ def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:
 def settings_page(groups: Sequence[SettingGroup]) -> str:
     """Return the page docs/settings.md."""
     lines = ["# Settings", "<!-- Written by `recon settings --markdown`. -->", _INTRODUCTION]
+    lines += ["", "## Presets", "```yaml", presets_text().rstrip("\n"), "```"]
     for group in groups:
         lines += ["", f"## {group.name}", group.purpose, ""]
         lines += ["| setting | default | values | what it does |", "|---|---|---|---|"]

@@ -16,7 +16,7 @@ def preset_values(name: str | None) -> Mapping[str, Any]:
     """Return the nested values of a preset; None = no preset, no values."""
     if name is None:
         return {}
-    known = parse_yaml(_text(), "presets.yaml")
+    known = parse_yaml(presets_text(), "presets.yaml")
     if name not in known:
         near = difflib.get_close_matches(str(name), known, n=1)
         raise SettingsError(
@@ -33,7 +33,7 @@ def preset_values(name: str | None) -> Mapping[str, Any]:
 def preset_text(name: str) -> str:
     """Return a preset as a file for ``--config``, with the lines that say for whom it is."""
     preset_values(name)  # refuses an unknown name
-    _, _, after = _text().partition(f"\n{name}:\n")
+    _, _, after = presets_text().partition(f"\n{name}:\n")
     lines = after.partition("\n\n")[0].splitlines()
     return (
         "\n".join([f"# recon's preset {name}", *(line.removeprefix("  ") for line in lines)]) + "\n"
@@ -41,5 +41,6 @@ def preset_text(name: str) -> str:
 
 
 @cache
-def _text() -> str:
+def presets_text() -> str:
+    """Return the file that has all presets."""
     return files("recon.commands").joinpath("presets.yaml").read_text(encoding="utf-8")
