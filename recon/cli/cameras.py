@@ -281,9 +281,9 @@ def capture(
         from recon.rig.capture import RecordingSettings
 
         known = shared.settings()
-        own = {"frames": frames, "seconds": seconds, "preview_every": preview}
-        own["side_by_side"] = known.source.side_by_side
-        settings = RecordingSettings.parse({**dict(known.capture), **own})
+        limits = {"frames": frames, "seconds": seconds, "preview_every": preview}
+        views = {"side_by_side": known.source.side_by_side}
+        settings = RecordingSettings.parse({**dict(known.capture), **views, **limits})
         devices = [left] if right is None else [left, right]
         with until_interrupted() as stopped:
             summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)

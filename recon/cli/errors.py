@@ -17,7 +17,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final
+from typing import Any, Final
 
 import typer
 
@@ -78,8 +78,8 @@ def one_line_errors(*, quiet: bool = False, verbose: bool = False) -> Iterator[N
         raise typer.Exit(report_unforeseen(error)) from None
 
 
-def _show_warning(message: Warning | str, kind: type[Warning], *_: object) -> None:
-    if issubclass(kind, FutureWarning):
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **_how: Any) -> None:
+    if issubclass(category, FutureWarning):
         typer.echo(f"warning: {message}", err=True)
 
 

@@ -81,8 +81,9 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings):
         every = _recorded(self, usual)
         groups = {name: every[name] for name in GROUPS.get(command, every) if name in every}
         if "matching" in groups:
-            used = filter(None, (self.matching.matcher, self.matching.keyframe_matcher))
-            kept = {"matcher", "keyframe_matcher"}.union(*map(settings_taken, used))
+            kept = {"matcher", "keyframe_matcher"} | settings_taken(self.matching.matcher)
+            if self.matching.keyframe_matcher is not None:
+                kept |= settings_taken(self.matching.keyframe_matcher)
             groups["matching"] = {k: v for k, v in groups["matching"].items() if k in kept}
         if self.street == usual[0].street:
             groups.pop("street", None)
@@ -114,7 +115,6 @@ PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
     "matching": {"matcher": "fine", "fill": "ours"},
     "cloud": {"min_range_m": 0.0, "max_range_m": None, "max_relative_sigma": None},
     "filters": ANY_SCALE.model_dump(),
-    "mesh": {"point_weight": 16.0},
 }
 """Defaults of a single pair that differ from a drive: the scale of its scene is unknown."""
 
@@ -216,7 +216,7 @@ def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[st
             raise SettingsError(what, got=name, expected=expected, hint="recon map takes it")
 
 
-def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:
+def _recorded(settings: Settings, usual: Sequence[Settings | None]) -> dict[str, Any]:
     """Return plain values, without what is open here and in the usual settings."""
     plain = settings.model_dump(mode="json")
     for name in type(settings).model_fields:
@@ -322,9 +322,9 @@ class SettingGroup:
 
 def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:
     """List the settings of a dotted name or part of one, and all below it; None = all."""
-    brought = {"matching": {name: {} for name in plugin_groups()}}
-    defaults = (ReconConfig.parse(merge(brought, values)) for values in ({}, PAIR_DEFAULTS))
-    every = tuple(_groups(*defaults))
+    brought: dict[str, Any] = {"matching": {name: {} for name in plugin_groups()}}
+    drive, pair = ReconConfig.parse(brought), ReconConfig.parse(merge(brought, PAIR_DEFAULTS))
+    every = tuple(_groups(drive, pair))
     names = [entry.name for group in every for entry in group.settings]
     if name is None:
         return every

@@ -48,11 +48,15 @@ CONSTANTS: Final[dict[str, Any]] = {
     "matching.onnx.time_limit_s": 600.0,
     "cloud.stride": 1,
     "odometry.prior.max_gap_s": 1.0,
+    "filters.radius_m": None,
+    "map_filters.voxel_m": None,
+    "map_filters.statistical_neighbours": None,
     "grid.min_blob_cells": 3,
     "mesh.cell_spacings": 1.5,
     "mesh.max_depth": 10,
     "mesh.trim_density_quantile": 0.01,
     "mesh.free_space": True,
+    "mesh.point_weight": (4.0, 16.0),  # of a map and of a pair
     "paper.as_printed": False,
     "paper.patches_px": [*range(3, 22, 2)],
     "street.baseline_m": 0.54,
@@ -143,6 +147,8 @@ def _without(values: Mapping[str, Any], names: Mapping[str, Any], prefix: str = 
 
 def _same(value: Any, other: Any) -> bool:
     value = None if value == "none" else value
+    if isinstance(other, tuple):
+        return any(_same(value, one) for one in other)
     if isinstance(value, int | float) and isinstance(other, int | float):
         return abs(value - other) <= 1e-6 * abs(other)
     return bool(value == other)

@@ -103,13 +103,12 @@ class Cutter:
 
     def __init__(self, config: DriveSettings, T_map_world: Float64, halvings: int = 0) -> None:
         self._config, self._T_map_world = config, T_map_world
-        resolution_m, filters = config.occupancy.resolution_m, config.map_filters
+        resolution_m = config.occupancy.resolution_m
         # A power of two, so that a tile is a branch of an octree.
         cells = round(math.log2(config.submaps.tile_m / resolution_m))
         self.edge_cells = 1 << max(BLOCK_BITS, cells - halvings)
         self.edge_m = self.edge_cells * resolution_m
-        margin_m = max(2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
-        margin_m = max(config.scale * _FILTER_MARGIN_M, margin_m)
+        margin_m = max(config.scale * _FILTER_MARGIN_M, config.map_filters.radius_m or 0.0)
         # A voxel more, since a point may lie anywhere in its voxel; and whether a point moved
         # depends on the points in the voxels that touch those through which it may have grown, at
         # the sides and then twice below.

@@ -103,7 +103,7 @@ def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> Triangl
     return merge([move(period, at(shift, 0.0, 0.0)) for shift in shifts])
 
 
-def rig(settings: StreetSettings) -> RectifiedCamera:
+def rig(settings: StreetScene) -> RectifiedCamera:
     """Return the rectified cameras of the settings, with principal points at the centre."""
     width, height = settings.width_px, settings.height_px
     cx, cy, focal = (width - 1) / 2, (height - 1) / 2, settings.focal_px

@@ -1,6 +1,7 @@
 """Points are exact, with their errors; those between surfaces and outliers are removed."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from recon.stereo.frame import (
     CloudSettings,
     FilterSettings,
     back_project,
+    drop_islands,
     filter_cloud,
     remove_flying_edges,
     voxel_downsample,
@@ -246,10 +248,12 @@ def wall_with_outliers() -> tuple[PointCloud, np.ndarray]:
     return PointCloud(xyz), np.arange(len(xyz)) < len(wall)
 
 
-@pytest.mark.parametrize("settings", [FilterSettings(radius_m=0.15), ANY_SCALE])
-def test_planted_outliers_go_and_the_planted_surface_stays(settings):
+@pytest.mark.parametrize(
+    "filtered", [partial(drop_islands, radius_m=0.15), partial(filter_cloud, settings=ANY_SCALE)]
+)
+def test_planted_outliers_go_and_the_planted_surface_stays(filtered):
     cloud, on_wall = wall_with_outliers()
-    near_wall = filter_cloud(cloud, settings).xyz[:, 2] > 4.9
+    near_wall = filtered(cloud).xyz[:, 2] > 4.9
     assert near_wall.sum() >= 0.99 * on_wall.sum()
     assert (~near_wall).sum() <= 0.05 * (~on_wall).sum()
     assert filter_cloud(cloud, FilterSettings()) is cloud
@@ -284,8 +288,7 @@ def test_a_voxel_averages_every_attribute():
 @pytest.mark.parametrize("points", [0, 1, 2])
 def test_clouds_of_almost_nothing_pass(points):
     cloud = PointCloud(np.zeros((points, 3), dtype=np.float32))
-    settings = FilterSettings(statistical_neighbours=20, radius_m=0.3)
-    assert len(filter_cloud(cloud, settings)) <= points
+    assert len(drop_islands(filter_cloud(cloud, ANY_SCALE), 0.3)) <= points
 
 
 def frozen(xyz: np.ndarray) -> np.ndarray:

@@ -30,6 +30,7 @@ _FARTHEST = 1000.0  # distance of a point from the middle, as a multiple of thei
 _SPACING_NEIGHBOURS = 7
 _SPACING_SAMPLES = 20_000
 _OCTREE_SCALE = 1.1  # MeshLab's octree is this much wider than the cloud
+POINT_WEIGHT: Final = 4.0  # of the points against their normals, of clouds with noise
 _LEAST_SUPPORTED: Final = 0.01  # of the vertices, which are cut off: bulges beyond the points
 _CELL_SPACINGS: Final = 1.5  # widest octree cell: noise becomes ripples in smaller ones
 _MAX_DEPTH: Final = 10  # that is chosen by the points: bounds time and memory
@@ -50,8 +51,6 @@ class MeshSettings(Settings):
     depth: int | None = Field(None, ge=4, le=12)
     """Octree depth of Poisson's; none = by the spacing of the points, at most 10. Each step halves
     the cells, and takes four times the memory."""
-    point_weight: float = Field(4.0, ge=0, le=1000.0)
-    """Weight of the points against their normals. Lower is smoother."""
     max_distance_spacings: float | None = Field(2.0, ge=0.01, le=1000000.0)
     """Farthest a vertex may lie from the points, in local point spacings; none = keep all. Lower it
     to keep holes open."""
@@ -82,6 +81,7 @@ def reconstruct_mesh(
     settings: MeshSettings,
     viewpoint_m: Point | None = None,
     wrong: Callable[[Float32], Bool] | None = None,
+    point_weight: float = POINT_WEIGHT,
 ) -> TriangleMesh:
     """Reconstruct the surface that a cloud was sampled from.
 
@@ -96,6 +96,7 @@ def reconstruct_mesh(
             only if the cloud has no normals. None = normals are only made consistent, and may
             all be flipped.
         wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
+        point_weight: Weight of the points against their normals; lower is smoother.
 
     Returns:
         The mesh, with outward unit normals, and colours if the cloud has any.
@@ -110,7 +111,7 @@ def reconstruct_mesh(
     depth = settings.depth or _fitting_depth(cloud.xyz)
     normals = np.asarray(cloud.normals)
     vertices, faces, density = screened_poisson(
-        cloud.xyz, normals, depth, _OCTREE_SCALE, settings.point_weight
+        cloud.xyz, normals, depth, _OCTREE_SCALE, point_weight
     )
     supported = density >= np.quantile(density, _LEAST_SUPPORTED)
     if settings.max_distance_spacings is not None:

@@ -71,7 +71,8 @@ class MatchingSettings(SearchSettings):
             chosen = [one for key, one in values.items() if key in _NAMES and isinstance(one, str)]
             groups = plugin_groups([*values, *chosen])
             if groups:
-                return _extended(frozenset(groups.items())).model_validate(values)
+                extended: Any = _extended(frozenset(groups.items()))
+                return extended.model_validate(values)  # type: ignore[no-any-return]
         return check(values)
 
 

@@ -102,8 +102,9 @@ class SadMatcher:
         # The middles of the two halves lie half a radius above and below the pixel.
         slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
         search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
-        checks = {"min_texture": _MIN_TEXTURE, "uniqueness": _UNIQUENESS_PERCENT}
-        return search, common.rules_of(s, ndisp, self._window_px**2, **checks)
+        return search, common.rules_of(
+            s, ndisp, self._window_px**2, min_texture=_MIN_TEXTURE, uniqueness=_UNIQUENESS_PERCENT
+        )
 
 
 class _StripSearch:
