@@ -18,8 +18,13 @@ class Renamed(NamedTuple):
 
     to: str
     default: Any = ...  # that it had, dropped where it is found; ... = none says nothing
-    length: bool = False  # whether the default is that on a road, to be multiplied by the scale
     values: Mapping[str, str] = {}  # names of its values that are others now
+
+
+class Length(NamedTuple):
+    """A length on a road, that follows from the size of the scene."""
+
+    road_m: float
 
 
 _COMMON: Final = {
@@ -38,7 +43,7 @@ RENAMED: Final[dict[str, Renamed]] = {
     "matching.opencv.block_px": Renamed("matching.window_px", None),
     "mesh.pair_surface": Renamed("mesh.surface", "grid"),
     "mesh.map_surface": Renamed("mesh.surface", "voxels", values={"voxels": "grid"}),
-    "ground.reach_m": Renamed("occupancy.max_range_m", 25.0, length=True),
+    "ground.reach_m": Renamed("occupancy.max_range_m", Length(25.0)),
     "robot.clearance_m": Renamed("grid.max_height_m", 2.0),
     "capture.side_by_side": Renamed("source.side_by_side", "left-right"),
 }
@@ -46,7 +51,9 @@ CONSTANTS: Final[dict[str, Any]] = {
     "matching.sgm.p1": 16.0,
     "matching.sgm.p2": 50.0,
     "matching.onnx.time_limit_s": 600.0,
+    "matching.onnx.tile_megapixels": 1.0,
     "cloud.stride": 1,
+    "odometry.max_range_m": Length(30.0),
     "odometry.prior.max_gap_s": 1.0,
     "filters.radius_m": None,
     "map_filters.voxel_m": None,
@@ -85,20 +92,21 @@ def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]
     found = {name: value for name in _NOTES if (value := _at(values, name)) is not ...}
     if not found:
         return dict(values), []
+    scale = _at(values, "scene.scale")
+    scale = scale if isinstance(scale, int | float) else 1.0
     constants = {**CONSTANTS, **(_IN_A_ROOM if _at(values, "street.path") == "room" else {})}
     for name in found.keys() & constants.keys():
-        if not _same(found[name], constants[name]):
+        if not _same(found[name], constants[name], scale):
             raise SettingsError(
                 f"setting {name!r} is a constant since {_SINCE}",
                 got=found[name],
-                expected=constants[name],
+                expected=_written(constants[name], scale),
                 hint="remove it, or use an earlier version",
             )
     kept = _without(values, found)
-    scale = _at(values, "scene.scale")
-    for to, name, value in _moved(found, scale if isinstance(scale, int | float) else 1.0):
+    for to, name, value in _moved(found, scale):
         given = _at(kept, to)
-        if given is not ... and not _same(value, given):
+        if given is not ... and not _same(value, given, scale):
             raise SettingsError(
                 f"{name} is {to} since {_SINCE}, which has another value here",
                 got=f"{value} and {given}",
@@ -114,8 +122,7 @@ def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]
 def _moved(found: Mapping[str, Any], scale: float) -> Iterator[tuple[str, str, Any]]:
     """Yield new name, old name and value of what is not as it is by default."""
     for name, new in RENAMED.items():
-        default = scale * new.default if new.length else new.default
-        if name in found and (default is ... or not _same(found[name], default)):
+        if name in found and (new.default is ... or not _same(found[name], new.default, scale)):
             yield new.to, name, new.values.get(str(found[name]), found[name])
     for to, names in JOINED.items():
         parts = [found.get(name) for name in names]
@@ -145,10 +152,14 @@ def _without(values: Mapping[str, Any], names: Mapping[str, Any], prefix: str = 
     return kept
 
 
-def _same(value: Any, other: Any) -> bool:
-    value = None if value == "none" else value
-    if isinstance(other, tuple):
-        return any(_same(value, one) for one in other)
+def _same(value: Any, other: Any, scale: float) -> bool:
+    if isinstance(other, tuple) and not isinstance(other, Length):
+        return any(_same(value, one, scale) for one in other)
+    value, other = None if value == "none" else value, _written(other, scale)
     if isinstance(value, int | float) and isinstance(other, int | float):
         return abs(value - other) <= 1e-6 * abs(other)
     return bool(value == other)
+
+
+def _written(value: Any, scale: float) -> Any:
+    return scale * value.road_m if isinstance(value, Length) else value

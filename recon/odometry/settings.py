@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field, InstanceOf, field_serializer
 
 from recon.core.plugins import name_of
-from recon.core.settings import Length, Settings
+from recon.core.settings import Settings
 from recon.odometry.protocol import Odometry
 
 
@@ -48,9 +48,6 @@ class OdometrySettings(Settings):
     """Use the inertial unit of a source that has one, without `--prior`: its gyro says how the
     camera turns, also where it sees nothing, its accelerometer what is up. Its bias, delay and axes
     are found from the drive."""
-    max_range_m: float = Length(30.0, ge=1e-06, le=100000.0)
-    """Points farther than this are not registered by kiss-icp (`kiss`, and `recon localize`). Raise
-    it with a wide baseline in open country."""
     prior: PriorSettings = PriorSettings()
 
     @field_serializer("method")

@@ -96,7 +96,7 @@ class OnnxNetwork:
                 options.terminate = True
         if late:
             what, got = "the network does not come to an end", f"{self._limit_s:g} s"
-            hint = "give it smaller images: matching.onnx.size_px or tile_megapixels"
+            hint = "give it smaller images: matching.onnx.size_px"
             raise MatchingError(what, where=self._path, got=got, hint=hint)
         return list(running.result())
 

@@ -25,6 +25,9 @@ from recon.stereo.match.self_test import check_network
 from recon.stereo.match.tiles import match_in_tiles
 
 _WHITE: Final = 255.0
+# Larger images are matched in tiles of so many pixels, where the network takes any size: a small
+# network needs 1 to 2 GB for them.
+_TILE_PX: Final = 1_000_000
 _TIME_LIMIT_S: Final = 600.0  # of an image or tile: one that never ends is refused
 Size = tuple[int, int]  # width and height
 _Length = Annotated[int, Field(ge=1, le=LARGEST_PX)]
@@ -59,9 +62,6 @@ class OnnxSettings(Settings):
     left_right: bool = True
     """Match the right view too, in twice the time: what both views agree on is kept, and how well
     they agree makes confidence and sigma_px. Else all matches have the same."""
-    tile_megapixels: float = Field(1.0, ge=0.1, le=1000)
-    """Larger images are matched in tiles of this size, which overlap; memory grows with it, by 1 to
-    2 GB per megapixel of a small network. Not where the network or size_px gives the size."""
     self_test: bool = True
     """Let the network match a rendered plane first, and refuse it if it does not find the
     disparity."""
@@ -149,7 +149,7 @@ class OnnxMatcher:
         def match(*views: UInt8) -> Float32:
             return self._run(network, views)
 
-        most = int(1e6 * self._settings.tile_megapixels) if size is None else views[0].size
+        most = _TILE_PX if size is None else views[0].size
         values = match_in_tiles(match, views, reach_px, most, multiple)
         return values[:height, :width] if size is None else _resized(values, (height, width))
 
