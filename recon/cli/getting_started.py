@@ -122,8 +122,12 @@ def settings(
     with one_line_errors(quiet=quiet):
         from dataclasses import asdict
 
-        from recon.commands.config import list_settings, settings_page
-        from recon.commands.presets import preset_text, preset_values
+        from recon.commands.config import (
+            list_settings,
+            preset_text,
+            preset_values,
+            settings_page,
+        )
 
         text = None if preset is None else preset_text(preset)
         groups = list_settings(name)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
 from os import PathLike
 from pathlib import Path
+from textwrap import dedent
 from typing import Any, Final, Literal, get_args, get_origin
 
 from pydantic import model_validator
 from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
-from recon.commands.presets import preset_values, presets_text
 from recon.core.errors import FormatError, SettingsError
 from recon.core.renamed import current_names
 from recon.core.settings import (
@@ -151,7 +154,7 @@ def load_config(
         # Several settings stand in one text with commas between.
         for part in map(_parse_override, _NEXT.split(one)) if isinstance(one, str) else [one]:
             changed, old = current_names(_nested(part))
-            if "preset" in changed:
+            if changed.get("preset") is not None:
                 hint = "--preset NAME, or recon.load_config(preset=NAME)"
                 raise SettingsError("a preset is not one of the settings", got=part, hint=hint)
             values, notes = merge(values, changed), [*notes, *old]
@@ -163,6 +166,36 @@ def load_config(
         if isinstance(path, str | PathLike):
             ReconConfig.parse(given, where=str(path))  # blames the file if it is invalid by itself
         raise
+
+
+def preset_values(name: str | None) -> Mapping[str, Any]:
+    """Return the nested values of a preset; None = no preset, no values."""
+    if name is None:
+        return {}
+    known: Mapping[str, Mapping[str, Any]] = parse_yaml(presets_text(), "presets.yaml")
+    if name not in known:
+        near = difflib.get_close_matches(str(name), known, n=1)
+        raise SettingsError(
+            "unknown preset",
+            where="--preset",
+            got=repr(name),
+            expected=f"one of: {', '.join(known)}",
+            hint=f"did you mean {near[0]}?" if near else "`recon settings --preset NAME` shows one",
+        )
+    return known[name]
+
+
+def preset_text(name: str) -> str:
+    """Return a preset as a file for ``--config``, with the lines that say for whom it is."""
+    preset_values(name)  # refuses an unknown name
+    block = presets_text().partition(f"\n{name}:\n")[2].partition("\n\n")[0]
+    return f"# recon's preset {name}\n{dedent(block.rstrip())}\n"
+
+
+@cache
+def presets_text() -> str:
+    """Return the file that has all presets."""
+    return files("recon.commands").joinpath("presets.yaml").read_text(encoding="utf-8")
 
 
 def _values_of(path: object) -> Mapping[str, Any]:

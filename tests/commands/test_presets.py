@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 import recon
-from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
-from recon.commands.presets import preset_text
+from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config, preset_text
 from recon.core.errors import SettingsError
 from recon.core.renamed import CONSTANTS, JOINED, RENAMED, current_names
 from recon.core.settings import setting_names
