@@ -21,7 +21,7 @@ class Renamed(NamedTuple):
     values: Mapping[str, str] = {}  # names of its values that are others now
 
 
-class Length(NamedTuple):
+class OnRoad(NamedTuple):
     """A length on a road, that follows from the size of the scene."""
 
     road_m: float
@@ -43,7 +43,7 @@ RENAMED: Final[dict[str, Renamed]] = {
     "matching.opencv.block_px": Renamed("matching.window_px", None),
     "mesh.pair_surface": Renamed("mesh.surface", "grid"),
     "mesh.map_surface": Renamed("mesh.surface", "voxels", values={"voxels": "grid"}),
-    "ground.reach_m": Renamed("occupancy.max_range_m", Length(25.0)),
+    "ground.reach_m": Renamed("occupancy.max_range_m", OnRoad(25.0)),
     "robot.clearance_m": Renamed("grid.max_height_m", 2.0),
     "capture.side_by_side": Renamed("source.side_by_side", "left-right"),
 }
@@ -53,7 +53,7 @@ CONSTANTS: Final[dict[str, Any]] = {
     "matching.onnx.time_limit_s": 600.0,
     "matching.onnx.tile_megapixels": 1.0,
     "cloud.stride": 1,
-    "odometry.max_range_m": Length(30.0),
+    "odometry.max_range_m": OnRoad(30.0),
     "odometry.prior.max_gap_s": 1.0,
     "filters.radius_m": None,
     "map_filters.voxel_m": None,
@@ -104,7 +104,10 @@ def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]
                 hint="remove it, or use an earlier version",
             )
     kept = _without(values, found)
+    idle = _idle(_at(values, "matching"))
     for to, name, value in _moved(found, scale):
+        if name.startswith(idle):
+            continue
         given = _at(kept, to)
         if given is not ... and not _same(value, given, scale):
             raise SettingsError(
@@ -117,6 +120,15 @@ def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]
             inner = {part: inner}
         kept = merge(kept, inner)
     return kept, [_NOTES[name] for name in found]
+
+
+def _idle(matching: Any) -> tuple[str, ...]:
+    """Return how old names begin that are of matchers which are not used, where that is said."""
+    if not isinstance(matching, Mapping) or not matching.get("matcher"):
+        return ()
+    names = (matching["matcher"], matching.get("keyframe_matcher"))
+    used = {str(name).partition("-")[0] for name in names}
+    return tuple(f"matching.{name}." for name in _COMMON if name not in used)
 
 
 def _moved(found: Mapping[str, Any], scale: float) -> Iterator[tuple[str, str, Any]]:
@@ -153,7 +165,7 @@ def _without(values: Mapping[str, Any], names: Mapping[str, Any], prefix: str = 
 
 
 def _same(value: Any, other: Any, scale: float) -> bool:
-    if isinstance(other, tuple) and not isinstance(other, Length):
+    if isinstance(other, tuple) and not isinstance(other, OnRoad):
         return any(_same(value, one, scale) for one in other)
     value, other = None if value == "none" else value, _written(other, scale)
     if isinstance(value, int | float) and isinstance(other, int | float):
@@ -162,4 +174,4 @@ def _same(value: Any, other: Any, scale: float) -> bool:
 
 
 def _written(value: Any, scale: float) -> Any:
-    return scale * value.road_m if isinstance(value, Length) else value
+    return scale * value.road_m if isinstance(value, OnRoad) else value

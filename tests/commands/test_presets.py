@@ -64,6 +64,10 @@ OLD: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "a reach in a room": ({"scene.scale": 0.2, "ground.reach_m": 5.0}, {"scene.scale": 0.2}),
     "a reach": ({"ground.reach_m": 30.0}, {"occupancy.max_range_m": 30.0}),
     "a constant": ({"grid.min_blob_cells": 3, "mesh.max_depth": 10}, {}),
+    "of another matcher": (
+        {"matching": {"matcher": "fine", "fine": {"ndisp": 64}, "sad": {"ndisp": 32}}},
+        {"matching": {"matcher": "fine", "ndisp": 64}},
+    ),
     "a size": ({"capture": {"width_px": 640, "height_px": 480}}, {"capture.size_px": [640, 480]}),
     "no size": ({"matching.onnx": {"width_px": None, "height_px": None}}, {}),
     "a rig in a room": (
