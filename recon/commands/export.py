@@ -178,7 +178,9 @@ def export_map(
     moved, kept = [*map(Path, images)], opened.store.path
     check_target(product, path, () if kept is None else [kept])
     known = opened.first.info.config
-    ran = load_config({name: known[name] for name in ReconConfig.model_fields if name in known})
+    ran = ReconConfig.parse(
+        {name: known[name] for name in ReconConfig.model_fields if name in known}
+    )
     ran = ran.at_scale(ran.scale)
     settings = load_config(ran, changes)
     check_changes(ran, settings, (*(REMADE if need_rays([product]) else ()), "mesh"))
