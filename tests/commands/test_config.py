@@ -24,7 +24,7 @@ from recon.run.directory import STARTED, state_folder
         ("pair", PAIR_DEFAULTS, ["filters.statistical_neighbours=none", "filters.voxel_m=0.1"]),
         ("pair", PAIR_DEFAULTS, ["matching.matcher=onnx", "matching.onnx.model=a.onnx"]),
         ("calibrate", {}, ["calibration.model=fisheye", "calibration.working_m=3"]),
-        ("paper", PAIR_DEFAULTS, ["matching.window_px=9"]),
+        ("paper", PAIR_DEFAULTS, ["matching.matcher=sad", "matching.window_px=9"]),
     ],
 )
 def test_a_dumped_configuration_loads_back_equal(tmp_path, command, defaults, overrides):
@@ -37,7 +37,7 @@ SETTINGS = ["matching.matcher=opencv-bm", "matching.opencv.pad=true", "fusion.vo
 
 
 @pytest.mark.parametrize("given", [
-    {"matching.matcher": "sgm", "matching.opencv.pad": True, "fusion.voxel_m": 0.2},
+    {"matching.matcher": "opencv-bm", "matching.opencv.pad": True, "fusion.voxel_m": 0.2},
     {"matching": {"matcher": "opencv-bm", "opencv": {"pad": True}}, "fusion": {"voxel_m": 0.2}},
     {"matching": {"matcher": "opencv-bm", "opencv.pad": True}, "fusion.voxel_m": 0.2},
     {"matching": {"matcher": "opencv-bm"}, "matching.opencv": {"pad": True}, "fusion.voxel_m": 0.2},
@@ -56,7 +56,7 @@ def test_settings_are_dicts_with_dotted_or_nested_keys(tmp_path, given):
 
 @pytest.mark.parametrize(("given", "why"), [
     ((None, {"matching.window": 9}), "unknown setting 'matching.window'.*window_px"),
-    (({"matching": {"sad": {"window": 9}}},), "unknown setting 'matching.window'"),
+    (({"matching": {"window": 9}},), "unknown setting 'matching.window'"),
     ((None, "window"), r"cannot read this setting \(got 'window', expected key=value\)"),
     ((None, {".".join("a" * 20): 1}), "cannot read this setting"),
     ((9,), r"not settings \(got int, expected a file, a mapping or a ReconConfig\)"),

@@ -117,7 +117,7 @@ def test_a_file_that_is_no_network_and_settings_that_disagree_are_refused(tmp_pa
     for name, words in (("bad.onnx", r"bad\.onnx"), ("none.onnx", "does not exist")):
         with pytest.raises(FormatError, match=words):
             match(tmp_path / name, pair_of(1, 2))
-    for values in ({"width_px": 8}, {"mean": (0.1, 0.2)}, {"std": (0.0,)}):
+    for values in ({"size_px": (8,)}, {"mean": (0.1, 0.2)}, {"std": (0.0,)}):
         with pytest.raises(SettingsError):
             OnnxSettings.parse(values)
     with pytest.raises(SettingsError, match=r"matching\.onnx\.model"):
