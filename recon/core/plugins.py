@@ -8,10 +8,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from itertools import chain
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from recon.core.errors import ReconError, SettingsError
-from recon.core.settings import Settings
+
+if TYPE_CHECKING:  # `recon doctor` lists packages where pydantic may be missing
+    from recon.core.settings import Settings
 
 _GROUPS: Final = "recon."  # what the names of our entry point groups begin with
 
@@ -45,6 +47,8 @@ class Plugins:
 
     def settings_class(self, name: str) -> type[Settings] | None:
         """Return the settings that a registered class brings as ``settings``; None = none."""
+        from recon.core.settings import Settings
+
         brought = getattr(self._load(name), "settings", None)
         usable = inspect.isclass(brought) and issubclass(brought, Settings)
         return brought if usable else None
