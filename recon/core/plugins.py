@@ -8,12 +8,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from itertools import chain
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from recon.core.errors import ReconError, SettingsError
-
-if TYPE_CHECKING:  # `recon doctor` lists packages where pydantic may be missing
-    from recon.core.settings import Settings
 
 _GROUPS: Final = "recon."  # what the names of our entry point groups begin with
 
@@ -45,24 +42,18 @@ class Plugins:
         """Return the names that installed packages register, without loading anything."""
         return entry_points(group=self.group).names
 
-    def settings_class(self, name: str) -> type[Settings] | None:
-        """Return the settings that a registered class brings as ``settings``; None = none."""
-        from recon.core.settings import Settings
+    def registered(self, name: str) -> Any:
+        """Return what a package registers, usually a class, before anything is made of it."""
+        with calling(SettingsError, "the plug-in does not load", where=self._origin(name)):
+            return self._point(name).load()
 
-        brought = getattr(self._load(name), "settings", None)
-        usable = inspect.isclass(brought) and issubclass(brought, Settings)
-        return brought if usable else None
-
-    def load(self, given: str | object, settings: Settings | None = None) -> Any:
-        """Return an object as it is, and make that of a name which a package registers.
-
-        A class that brings settings gets ``settings``, or their defaults where they are None.
-        """
+    def load(self, given: str | object, *arguments: object) -> Any:
+        """Return an object as it is, and make that of a name which a package registers."""
         if not isinstance(given, str):
             return given
-        origin, make, own = self._origin(given), self._load(given), self.settings_class(given)
+        origin, make = self._origin(given), self.registered(given)
         with calling(SettingsError, "the plug-in does not load", where=origin):
-            made = make() if own is None else make(settings or own())
+            made = make(*arguments)
         if inspect.isclass(made) or not self._fits(made):
             raise SettingsError(
                 f"the plug-in makes no {self.kind}",
@@ -72,10 +63,6 @@ class Plugins:
                 f"brings, and gives {self._expected}",
             )
         return made
-
-    def _load(self, name: str) -> Any:
-        with calling(SettingsError, "the plug-in does not load", where=self._origin(name)):
-            return self._point(name).load()
 
     def _origin(self, name: str) -> str:
         return f"{self.kind} {name!r} ({_origin(self._point(name))})"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Collection, Mapping
 from functools import cache
 from typing import Any, Final
@@ -86,8 +87,9 @@ def plugin_groups(named: Collection[Any] | None = None) -> dict[str, type[Settin
     groups = {}
     for name in sorted({*protocol.PLUGINS.names()} - {*MATCHERS}):
         if named is None or {name, field_of(name)} & {*named}:
-            brought = protocol.PLUGINS.settings_class(name)
-            if brought is not None:
+            # A class brings settings as its attribute; it is made with them.
+            brought = getattr(protocol.PLUGINS.registered(name), "settings", None)
+            if inspect.isclass(brought) and issubclass(brought, Settings):
                 groups[field_of(name)] = brought
     return groups
 
@@ -112,8 +114,10 @@ def make_matcher(
     settings = settings or MatchingSettings()
     if not isinstance(matcher, str) or matcher not in MATCHERS:
         check_matcher(matcher)
-        own = getattr(settings, field_of(name_of(matcher)), None)
-        given = protocol.PLUGINS.load(matcher, own)
+        group = field_of(name_of(matcher))
+        brought = plugin_groups([matcher]).get(group) if isinstance(matcher, str) else None
+        own = () if brought is None else (getattr(settings, group, None) or brought(),)
+        given = protocol.PLUGINS.load(matcher, *own)
         return AutoRangeMatcher(protocol.CheckedMatcher(given, name_of(matcher)))
     made = MATCHERS[matcher](settings, threads)
     if "fill" in settings_taken(matcher) and _fills(matcher, settings):
