@@ -9,7 +9,13 @@ import pytest
 import yaml
 
 import recon
-from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config, preset_text
+from recon.commands.config import (
+    PAIR_DEFAULTS,
+    ReconConfig,
+    check_changes,
+    load_config,
+    preset_text,
+)
 from recon.core.errors import SettingsError
 from recon.core.renamed import CONSTANTS, JOINED, RENAMED, current_names
 from recon.core.settings import setting_names
@@ -127,3 +133,13 @@ def test_a_command_shows_the_new_name_once(tmp_path: Path):
         "matching.sad.ndisp is matching.ndisp since 1.0; "
         "matching.sgm.p1 is a constant since 1.0: remove it"
     )
+
+
+def test_what_a_preset_says_of_a_finished_drive_is_no_change_of_it_and_a_wish_is():
+    ran = load_config(None, ["fusion.min_count=2"])
+    known = ran.model_dump(mode="json", exclude={"preset"})
+    chosen = load_config(None, (), known, preset="fast")
+    check_changes(ran, chosen, ("grid",))
+    assert chosen.source.stride == 2
+    with pytest.raises(SettingsError, match=r"not mapped again \(got source"):
+        check_changes(ran, load_config(chosen, {"source.stride": 3}), ("grid",))
