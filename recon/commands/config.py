@@ -114,6 +114,9 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """The groups of settings that determine the result of each command."""
 
+REMADE: Final = ("occupancy", "grid", "ground", "robot", "submaps")
+"""Groups that may differ from those of a run where its rays are cast again."""
+
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
     "matching": {"matcher": "fine", "fill": "ours"},
     "cloud": {"min_range_m": 0.0, "max_range_m": None, "max_relative_sigma": None},
@@ -219,8 +222,9 @@ def run_settings(
 ) -> ReconConfig:
     """Return the settings of a finished run of map, demo or pair, with changes.
 
-    The preset comes before the file, and that before the overrides. The sections ``without`` are
-    the defaults again, since they are of its source.
+    The preset comes before the file, and that before the overrides; it changes only what a
+    finished run can be given. The sections ``without`` are the defaults again, since they are of
+    its source.
     """
     if is_pair_run(folder):
         return load_config(file, overrides, PAIR_DEFAULTS, preset=preset)
@@ -230,8 +234,11 @@ def run_settings(
         what = f"the settings of this run are not valid in this version: {error.what}"
         how = {"where": error.where, "got": error.got, "hint": "map the drive again"}
         raise SettingsError(what, **how) from error
-    known = own.model_dump(mode="json", exclude={*without, "preset"})
-    return load_config(file, overrides, known, preset=preset)
+    known = own.model_dump(mode="json", exclude=set(without))
+    given = {*REMADE, "mesh", "memory"}
+    chosen = {group: part for group, part in preset_values(preset).items() if group in given}
+    known = merge(known, chosen if preset is None else {**chosen, "preset": preset})
+    return load_config(file, overrides, known)
 
 
 def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[str]) -> None:

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shutil import copyfile
-from typing import Any, Final
+from typing import Any
 
 from recon.commands.config import (
+    REMADE,
     Changes,
     ReconConfig,
     check_changes,
@@ -43,9 +44,6 @@ from recon.run.finished import (
     refuse_as_target,
 )
 from recon.run.run import Run
-
-REMADE: Final = ("occupancy", "grid", "ground", "robot", "submaps")
-"""Sections of the configuration that may differ from those of the run where rays are cast."""
 
 
 def run_export(
