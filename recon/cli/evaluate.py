@@ -301,7 +301,7 @@ def paper(
         ),
     ] = None,
     as_printed: Annotated[
-        bool, opt.setting("paper.as_printed", "Also run the method as printed.", "--as-printed")
+        bool, opt.option("Also run the method as printed.", "--as-printed")
     ] = False,
     out: opt.Out = None,
     *,
@@ -322,5 +322,7 @@ def paper(
         from recon.commands.paper import headline, run_paper
 
         settings = shared.settings(PAIR_DEFAULTS)
-        summary = run_paper(scenes, settings, out=out, threads=shared.threads)
+        summary = run_paper(
+            scenes, settings, out=out, threads=shared.threads, as_printed=as_printed
+        )
     shared.show(summary if shared.json else {**headline(summary), **summary})

@@ -13,8 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.commands.config import ReconConfig, check_changes, run_settings
-from recon.commands.export import REMADE
+from recon.commands.config import REMADE, ReconConfig, check_changes, run_settings
 from recon.commands.map import look_first, map_drive
 from recon.commands.map_options import MapOptions
 from recon.core.errors import FormatError, ReconError, SettingsError

@@ -17,8 +17,7 @@ from recon.look.rig import LATER, MOST_TIME_OFFSET, MOVES, RefinedRig
 from recon.look.sample import BLANK_DN, Sample
 from recon.look.settings import AuditedSettings
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.registry import MatchingSettings, settings_of
-from recon.stereo.match.search import SearchSettings
+from recon.stereo.match.registry import MatchingSettings, settings_taken
 
 Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
@@ -250,7 +249,7 @@ def _centres(rig: Rig) -> list[tuple[str, tuple[float, float], tuple[int, int]]]
 
 def _reach_px(camera: RectifiedCamera, matching: MatchingSettings) -> int | None:
     """Return the largest disparity that is searched; None if the range adapts to each pair."""
-    own = settings_of(matching.matcher, matching)
-    if not isinstance(own, SearchSettings) or (own.ndisp is None and camera.ndisp is None):
+    adapts = matching.ndisp is None and camera.ndisp is None
+    if adapts or "ndisp" not in settings_taken(matching.matcher):
         return None
-    return own.min_disparity_px + own.ndisp_for(camera)
+    return matching.min_disparity_px + matching.ndisp_for(camera)

@@ -83,7 +83,9 @@ def open_camera_source(
             expected=0,
             hint="record them with recon capture, and map the recording with it",
         )
-    recording = RecordingSettings.parse({**dict(settings), "frames": source.end})
+    recording = RecordingSettings.parse(
+        {**dict(settings), "side_by_side": source.side_by_side, "frames": source.end}
+    )
     with open_cameras(devices, settings) as cameras:
         where = " and ".join(camera.name for camera in cameras)
         if not source.has_camera:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, Literal, Protocol
 
 from recon.core.values import Disparity, Rectified, RectifiedImage, RectifiedPair
-from recon.stereo.match.registry import MatchingSettings, make_matcher, searched
+from recon.stereo.match.registry import MatchingSettings, make_matcher
 from recon.stereo.match.sad import HalfSizeMatcher
 from recon.stereo.rectify.features import (
     INSPECTED,
@@ -43,7 +43,7 @@ class Matching:
         self, rectifier: Rectifier, settings: MatchingSettings, threads: int | None
     ) -> None:
         self.rectify = rectifier.rectify
-        self._searched, self._threads = searched(settings), threads
+        self._searched, self._threads = settings, threads
         names = {"match": settings.matcher, "match_keyframes": settings.keyframe_matcher}
         self.matchers = {
             effort: make_matcher(name, settings, threads)

@@ -135,7 +135,7 @@ def test_a_thickness_that_is_none_is_refused(thick):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("other", [{"pair_surface": "poisson"}, {"target_faces": 1000}])
+@pytest.mark.parametrize("other", [{"surface": "poisson"}, {"target_faces": 1000}])
 def test_what_cannot_be_closed_is_said_before_anything_is_made(other):
     with pytest.raises(SettingsError, match="pair_solid_m"):
         MeshSettings.parse({"pair_solid_m": 0.1, **other})

@@ -29,15 +29,17 @@ OCCUPIED_PROBABILITY: Final = 0.55
 FREE_PROBABILITY: Final = 0.35  # voxels at most this probable are free
 
 
+MIN_BLOB_CELLS: Final = 3  # fewer connected blocked cells are taken for noise
+
+
 class GridSettings(Settings):
     """How voxels are flattened. Heights are of centres of voxels, above the local ground."""
 
     min_height_m: float = Field(0.3, ge=0.0, le=10.0)
     """Lower end of the band in which obstacles are looked for: what the vehicle can drive over."""
     max_height_m: float = Field(2.0, ge=0.01, le=100.0)
-    """Upper end of the band: what is higher is passed under. The height of the vehicle."""
-    min_blob_cells: int = Field(3, ge=1, le=100_000_000)
-    """Connected blocked cells fewer than this are taken for noise. 1 keeps thin posts."""
+    """Upper end of the band: what is higher is passed under. The height of the vehicle, or of the
+    robot that a costmap is for."""
     vehicle_width_m: float = Field(0.6, ge=0.0, le=10.0)
     """Width of what carried the camera: cells that it passed over are free; 0 = only what was seen
     is free."""
@@ -70,7 +72,7 @@ def flatten(
     full = voxels.log_odds >= log_odds(OCCUPIED_PROBABILITY)
     empty = voxels.log_odds <= log_odds(FREE_PROBABILITY)
     solid = number_in(hit & full)
-    blocked = _without_small_blobs(solid > 0, s.min_blob_cells)
+    blocked = _without_small_blobs(solid > 0, MIN_BLOB_CELLS)
     hit_low = number_in(hit & low_air) > 0
     free = (number_in(empty & low_air) > 0) & ~blocked & ~(hit_low & _beside(blocked))
     seen = number_in(empty & (height >= 0)) > 0

@@ -13,7 +13,6 @@ from typing import Final, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from recon.core.values import Disparity, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
@@ -41,24 +40,13 @@ _COST_CAP: Final = 20
 WINDOW_SLANT: Final = 1 / 3
 RADIUS_PX: Final = 3  # half the window at half size: with that of full size thin things are lost
 UNIQUENESS_PERCENT: Final = 5
+_WINDOW_PX, _MOST_WINDOW_PX = 11, 55  # usual and widest edge of the window: its costs fit 16 bits
+_UNIQUENESS_PERCENT: Final = 2  # of a search at full size; at half size more is asked
 LEAST_NDISP: Final = 32  # with fewer candidates a search at half size takes longer than it saves
 TILE_HEIGHT_PX: Final = 16
 _TILE_COLUMNS: Final = 160  # columns of a tile together with those that its windows reach over
 # How much support at half size offers candidates to a tile.
 SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, ratio=0.03, least=4)
-
-
-class SadSettings(common.MeasuredSettings, common.FillableSettings):
-    """Settings of the SAD matcher."""
-
-    window_px: common.OddInt = Field(11, ge=1, le=55)
-    """Edge of the square window; odd. Smaller keeps thin things and sharp edges, larger is denser
-    where texture is weak."""
-    uniqueness_percent: common.UniquenessPercent = 2
-
-    @property
-    def reach_px(self) -> int:
-        return self.window_px // 2
 
 
 class SadMatcher:
@@ -70,9 +58,11 @@ class SadMatcher:
     """
 
     def __init__(
-        self, settings: SadSettings, threads: int | None = None, *, average: bool = True
+        self, settings: common.SearchSettings, threads: int | None = None, *, average: bool = True
     ) -> None:
         self._settings = settings
+        self._window_px = settings.window_within(_WINDOW_PX, _MOST_WINDOW_PX)
+        self.reach_px = self._window_px // 2
         self._average = average
         self._threads = max(1, threads or os.cpu_count() or 1)
         self._full = _StripSearch(self._threads)
@@ -80,9 +70,8 @@ class SadMatcher:
 
     def match(self, pair: RectifiedPair) -> Disparity:
         search, rules = self._plan(pair.camera)
-        s = self._settings
         with ThreadPoolExecutor(self._threads) as pool:
-            enough = partial(common.texture, pair, s.window_px)
+            enough = partial(common.texture, pair, self._window_px)
             tiles = self._tiles(pool, pair, search)
             refined = self._full.find(pool, (pair.left, pair.right), search, tiles, rules, enough)
             return common.finish(refined, pool, self._threads, average=self._average)
@@ -109,11 +98,13 @@ class SadMatcher:
     def _plan(self, camera: RectifiedCamera) -> tuple[Search, Rules]:
         s = self._settings
         ndisp = s.ndisp_within(camera)
-        radius = s.window_px // 2
+        radius = self.reach_px
         # The middles of the two halves lie half a radius above and below the pixel.
         slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
         search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
-        return search, common.rules_of(s, ndisp, s.window_px**2, min_texture=_MIN_TEXTURE)
+        return search, common.rules_of(
+            s, ndisp, self._window_px**2, min_texture=_MIN_TEXTURE, uniqueness=_UNIQUENESS_PERCENT
+        )
 
 
 class _StripSearch:
@@ -177,7 +168,9 @@ def half_search(search: Search) -> Search:
 
 def half_rules(search: Search) -> Rules:
     """Return what makes a match of a search at half size reliable."""
-    asked = SadSettings(min_disparity_px=search.minimum, uniqueness_percent=UNIQUENESS_PERCENT)
+    asked = common.SearchSettings(
+        min_disparity_px=search.minimum, uniqueness_percent=UNIQUENESS_PERCENT
+    )
     return common.rules_of(asked, search.ndisp, (2 * RADIUS_PX + 1) ** 2)._replace(fit=False)
 
 
@@ -226,7 +219,7 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     usual = common.usual_ndisp(width)
     if width // factor < 6 or height < factor:
         return usual
-    settings = SadSettings(window_px=7, uniqueness_percent=10)
+    settings = common.SearchSettings(window_px=7, uniqueness_percent=10)
     found = SadMatcher(settings, threads=1, average=False).match(_smaller(pair, factor))
     trusted = found.values[found.valid & (found.confidence >= _CONFIDENCE)]
     if trusted.size < _LEAST_MATCHES:
@@ -246,7 +239,7 @@ def _smaller(pair: RectifiedPair, factor: int) -> RectifiedPair:
 
 Number = TypeVar("Number", np.float32, np.uint8)
 
-_WINDOW_PX: Final = 7  # edge of the window at half size: nearly that of `sad` at full size
+_HALF_WINDOW_PX: Final = 7  # edge of the window at half size: nearly that at full size
 
 
 class HalfSizeMatcher:
@@ -257,8 +250,8 @@ class HalfSizeMatcher:
     """
 
     def __init__(self, searched: common.SearchSettings, threads: int | None = None) -> None:
-        half = SadSettings(
-            window_px=_WINDOW_PX,
+        half = common.SearchSettings(
+            window_px=_HALF_WINDOW_PX,
             min_disparity_px=searched.min_disparity_px // 2,
             ndisp=None if searched.ndisp is None else max(3, -(-searched.ndisp // 2)),
         )

@@ -15,11 +15,11 @@ from recon.io.middlebury import stand_in_camera
 from recon.stereo.kernels.convolution import UNIT
 from recon.stereo.match import fine, segments, sgm
 from recon.stereo.match.features import Describer, fine_grey, load_network
-from recon.stereo.match.fine import FineSettings
 from recon.stereo.match.registry import MatchingSettings, make_matcher
+from recon.stereo.match.search import SearchSettings
 
 HEIGHT, WIDTH = 120, 240
-SETTINGS = FineSettings(ndisp=48)
+SETTINGS = SearchSettings(ndisp=48)
 
 
 def rendered(truth: np.ndarray, texture: np.ndarray, noise: float = 1.0) -> RectifiedPair:
@@ -47,7 +47,7 @@ def ground() -> np.ndarray:
 
 
 def match(pair: RectifiedPair, threads: int | None = None, **settings: int) -> Disparity:
-    asked = MatchingSettings.parse({"fine": {"ndisp": 48, "fill": True, **settings}})
+    asked = MatchingSettings.parse({"ndisp": 48, "fill": True, **settings})
     return make_matcher("fine", asked, threads).match(pair)
 
 
@@ -71,7 +71,7 @@ def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
     assert filled[plain].mean() > 0.1
     assert (error[plain][filled[plain]] < 1).mean() > 0.95
     assert filled[45:75, 125:140].mean() > filled[85:, 60:].mean()
-    only = sgm.SgmMatcher(sgm.SgmSettings(ndisp=48)).match(pair)
+    only = sgm.SgmMatcher(SETTINGS).match(pair)
     assert (np.abs(only.values - truth)[plain] < 1).mean() < 0.3
     seen = found.reason == Reason.VALID
     assert np.median(found.sigma_px[filled]) > 2 * np.median(found.sigma_px[seen])
