@@ -60,9 +60,9 @@ def measure(drive: Path, reference: Path, poses: Path, folder: Path) -> dict[str
     summary = run_map(open_source(drive), load_config(None), options).summary.to_json()
     mapping_s = summary["frames"] / summary["fps"]
     true, found = replace(read_ply(reference), frame="camera"), {}
-    for way in ("voxels", "poisson"):
+    for way in ("grid", "poisson"):
         out = folder / way
-        config = load_config(run / "config.yaml", [f"mesh.map_surface={way}"])
+        config = load_config(run / "config.yaml", [f"mesh.surface={way}"])
         # The surface needs points and voxels of tiles, which the others make first.
         run_export(run, config, products=("cloud", "octomap", "mesh"), out=out)
         seconds = json.loads((out / "run.json").read_text())["timings"]["mesh"]

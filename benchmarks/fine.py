@@ -83,7 +83,8 @@ def serve(options: argparse.Namespace) -> None:
     from recon.core.values import Reason, RectifiedPair  # noqa: PLC0415
     from recon.io.images.disparity import read_pfm  # noqa: PLC0415
     from recon.io.middlebury import stand_in_camera  # noqa: PLC0415
-    from recon.stereo.match.fine import FineMatcher, FineSettings  # noqa: PLC0415
+    from recon.stereo.match.fine import FineMatcher  # noqa: PLC0415
+    from recon.stereo.match.search import SearchSettings  # noqa: PLC0415
 
     if options.other.resolve() not in Path(recon.__file__).parents:
         raise RuntimeError(f"{recon.__file__} is not of {options.other}")
@@ -92,7 +93,7 @@ def serve(options: argparse.Namespace) -> None:
     camera = stand_in_camera(one.shape[1], one.shape[0], options.ndisp)
     pair = RectifiedPair(one, other, camera, left_rgb=left, right_rgb=right)
     truth = read_pfm(options.truth) if options.truth else None
-    matcher = FineMatcher(FineSettings())
+    matcher = FineMatcher(SearchSettings())
     for _ in sys.stdin:
         before, processor = time.perf_counter(), time.process_time()
         found = matcher.match(pair)

@@ -1,7 +1,7 @@
 """How much the drift of kiss-icp depends on what should not matter: its range, by half a metre.
 
 The rig is refined first, as `recon map` does it. A frame is matched once, and its points go to
-several odometries that differ in nothing but `odometry.max_range_m`. A last bit of a point or the
+several odometries that differ in nothing but their range. A last bit of a point or the
 order of the points changes the path as much: a single figure of kiss-icp is one draw, so the
 median and the range are given.
 
@@ -22,18 +22,19 @@ from altered_drives import alterations, run
 
 from recon.commands.config import load_config
 from recon.look.look import refine_rig
-from recon.odometry.registry import make_odometry
-from recon.odometry.settings import OdometrySettings
+from recon.odometry.checked import CheckedOdometry
+from recon.odometry.kiss import KissOdometry
+from recon.odometry.visual import VisualOdometry
 from recon.sources.registry import open_source
 
 RANGES_M = tuple(29.5 + 0.1 * step for step in range(11))
-"""Around the default of `odometry.max_range_m`."""
+"""Around `recon.odometry.kiss.RANGE_M`."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     options = parse(arguments)
     odometries = {
-        f"{range_m:g}": make_odometry("kiss", OdometrySettings(max_range_m=range_m))
+        f"{range_m:g}": CheckedOdometry(KissOdometry(range_m, VisualOdometry(None)), 1.0)
         for range_m in options.ranges
     }
     drive, config = alterations(open_source(options.drive))["as it is"], load_config(None, [])

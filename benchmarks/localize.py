@@ -29,6 +29,7 @@ from altered_drives import Altered, Change, alterations
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.demo import demo_source
 from recon.core.geometry import se3
+from recon.core.settings import scaled
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64, UInt8
 from recon.map.drive.drive import Workspace
@@ -37,7 +38,7 @@ from recon.map.localize.sequence import localize_sequence
 from recon.map.localize.surroundings import Surroundings
 from recon.map.map import Map
 from recon.map.store.map_file import MapViews
-from recon.odometry.kiss import select_points
+from recon.odometry.kiss import RANGE_M, select_points
 from recon.odometry.protocol import OdometryFrame
 from recon.places.detector import KnownPlaces, KnownView
 from recon.places.keyframe import Keyframe, make_keyframe
@@ -164,7 +165,8 @@ def errors(off: Any) -> dict[str, Any]:
 def naive(case: Altered, map_: Map, config: ReconConfig) -> dict[str, Any]:
     """kiss-icp from a pose that is off, without a filter."""
     random = np.random.default_rng(0)
-    around = Surroundings(map_, config.odometry.max_range_m)
+    range_m = scaled(RANGE_M, config.scale)
+    around = Surroundings(map_, range_m)
     reconstructor = FrameReconstructor(case.calibration, config)
     off = []
     for T_true, pair in zip(case.T_world_camera, case, strict=True):
@@ -172,7 +174,7 @@ def naive(case: Altered, map_: Map, config: ReconConfig) -> dict[str, Any]:
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
         step = np.concatenate([OFF_M * axis[0], np.radians(OFF_DEG) * axis[1]])
         frame = OdometryFrame(*reconstructor.match(pair))
-        xyz = select_points(frame, config.odometry.max_range_m).xyz
+        xyz = select_points(frame, range_m).xyz
         T = around.align(xyz.astype(np.float64), T_true @ se3.as_transform(step)).T_world_camera
         off.append(se3.invert(T_true) @ T)
     return {"frames": len(off), **errors(np.stack(off))}

@@ -258,7 +258,8 @@ def flat_grid(mapped: MappedSequence) -> OccupancyGrid:
     cloud = transform_cloud(mapped.cloud, T, frame="map")
     path_m = se3.apply(T, mapped.trajectory.positions_m)
     floor = add_floors(cloud, find_floors(mapped.voxels))
-    ground = estimate_ground_surface(floor, path_m, config.ground)
+    reach_m = config.occupancy.max_range_m
+    ground = estimate_ground_surface(floor, path_m, config.ground, reach_m)
     return flatten(mapped.voxels, ground, config.grid)
 
 

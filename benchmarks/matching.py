@@ -30,8 +30,9 @@ from recon.core.values.arrays import UInt8
 from recon.io.middlebury import stand_in_camera
 from recon.stereo.match import sad
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.sad import SadMatcher, SadSettings
-from recon.stereo.match.sgm import SgmMatcher, SgmSettings
+from recon.stereo.match.sad import SadMatcher
+from recon.stereo.match.search import SearchSettings
+from recon.stereo.match.sgm import SgmMatcher
 
 SIZES = ((480, 640, 64), (375, 1242, 128), (994, 1482, 144))
 GROWTH = ((188, 621, 64), (375, 1242, 64), (375, 1242, 128), (375, 1242, 256), (750, 2484, 128))
@@ -136,8 +137,8 @@ def add_noise(image: UInt8, rng: np.random.Generator) -> UInt8:
 def ours(pair: RectifiedPair, threads: int) -> dict[str, Run]:
     """`sad`, `sad` without its second, slanted window (StereoBM has none), and `sgm`."""
     matchers: dict[str, Matcher] = {
-        "sad": SadMatcher(SadSettings(window_px=WINDOW_PX), threads),
-        "sgm": SgmMatcher(SgmSettings(), threads),
+        "sad": SadMatcher(SearchSettings(window_px=WINDOW_PX), threads),
+        "sgm": SgmMatcher(SearchSettings(), threads),
     }
     runs = {name: partial(matcher.match, pair) for name, matcher in matchers.items()}
     return {**runs, "sad-upright": partial(upright, matchers["sad"], pair)}

@@ -46,7 +46,7 @@ from recon.evaluation.middlebury.bench import find_scenes, read_scored_scene
 from recon.io.images.disparity import read_disparity
 from recon.io.images.image import read_image
 from recon.io.middlebury import stand_in_camera
-from recon.stereo.match.registry import MatchingSettings, field_of, make_matcher
+from recon.stereo.match.registry import MatchingSettings, make_matcher, settings_taken
 from recon.stereo.rectify.rectifier import Rectifier
 from recon.street.render import StreetCamera
 from recon.street.settings import StreetScene
@@ -194,10 +194,8 @@ def results(scene: Scene, matchers: Sequence[str]) -> Iterator[tuple[str, Figure
     """Yield the figures of each matcher, with and without filling where it has that setting."""
     for matcher in matchers:
         for filled in fillings(matcher):
-            group: dict[str, Any] = {} if filled is None else {"fill": filled}
-            if matcher.startswith("opencv"):
-                group["pad"] = True
-            made = make_matcher(matcher, MatchingSettings.parse({field_of(matcher): group}))
+            asked = MatchingSettings.parse({"fill": filled or False, "opencv": {"pad": True}})
+            made = make_matcher(matcher, asked)
             made.match(first_rows(scene.pair))
             start = time.perf_counter()
             found = made.match(scene.pair)
@@ -207,8 +205,7 @@ def results(scene: Scene, matchers: Sequence[str]) -> Iterator[tuple[str, Figure
 
 
 def fillings(matcher: str) -> tuple[bool | None, ...]:
-    own = getattr(MatchingSettings(), field_of(matcher))
-    return (False, True) if hasattr(own, "fill") else (None,)
+    return (False, True) if "fill" in settings_taken(matcher) else (None,)
 
 
 def first_rows(pair: RectifiedPair) -> RectifiedPair:

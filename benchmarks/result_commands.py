@@ -58,8 +58,8 @@ REFINED: Final = {
     "refined (default)": (),
 }
 
-OPENCV, FILLED = "opencv-bm,opencv-sgbm", "--set matching.opencv.fill=true"
-MEASURED: Final = "--set matching.sad.fill=false --set matching.sgm.fill=false"
+OPENCV, FILLED = "opencv-bm,opencv-sgbm", "--set matching.fill=true"
+MEASURED: Final = "--set matching.fill=false"
 PADDED: Final = "--set matching.opencv.pad=true"
 ON_KEYFRAMES: Final = "--set matching.keyframe_matcher=fine"
 KNOWN_POSES: Final = {

@@ -50,16 +50,19 @@ class Vehicle(NamedTuple):
 
     scene: dict[str, float]
     robot: dict[str, float]
+    height_m: float  # of the robot
 
 
 VEHICLES: Final = {
     "car": Vehicle(
         {"baseline_m": 0.54, "camera_height_m": 1.65, "pitch_deg": 4.0, "speed_m_per_frame": 0.5},
-        {"wheel_radius_m": 0.15, "width_m": 0.6, "clearance_m": 2.0},
+        {"wheel_radius_m": 0.15, "width_m": 0.6},
+        2.0,
     ),
     "small robot": Vehicle(
         {"baseline_m": 0.12, "camera_height_m": 0.6, "pitch_deg": 6.0, "speed_m_per_frame": 0.2},
-        {"wheel_radius_m": 0.1, "width_m": 0.5, "clearance_m": 1.0},
+        {"wheel_radius_m": 0.1, "width_m": 0.5},
+        1.0,
     ),
 }
 #: What can stand in a lane, with its size; and the least step (m) or slope that it is over.
@@ -80,7 +83,7 @@ class Course(SyntheticSource):
     def __init__(self, seed: int, vehicle: Vehicle, frames: int) -> None:
         size = {"width_px": 640, "height_px": 360, "focal_px": 360.0, "smooth_edges": False}
         super().__init__(StreetScene(seed=seed, frames=frames, **size, **vehicle.scene))
-        self.name, self._clearance_m = f"course {seed}", vehicle.robot["clearance_m"]
+        self.name, self._clearance_m = f"course {seed}", vehicle.height_m
         self.marks: list[tuple[str, Float64]] = []
         self._pits: list[Box] = []
 
@@ -189,6 +192,7 @@ def measured(vehicle: Vehicle, options: argparse.Namespace) -> dict[str, Any]:
     """Cells of each kind in each band, and what must not be."""
     counts: dict[str, dict[str, Counter[str]]] = defaultdict(lambda: defaultdict(Counter))
     robot = {f"robot.{name}": value for name, value in vehicle.robot.items()}
+    robot["grid.max_height_m"] = vehicle.height_m
     config = load_config(None, [robot, "loops.enabled=false", *options.set])
     for seed in options.seeds:
         source = Course(seed, vehicle, options.frames)

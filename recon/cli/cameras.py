@@ -243,11 +243,11 @@ def audit(
     print_summary(summary, as_json=shared.json, verbose=verbose)
 
 
-def _size(text: str) -> dict[str, str]:
+def _size(text: str) -> dict[str, list[str]]:
     width, _, height = text.partition("x")
     if not (is_count(width) and is_count(height)):
         raise SettingsError("cannot read this size", got=text, expected="WIDTHxHEIGHT: 1280x720")
-    return {"capture.width_px": width, "capture.height_px": height}
+    return {"capture.size_px": [width, height]}
 
 
 @opt.takes_groups
@@ -284,9 +284,10 @@ def capture(
         from recon.commands.cameras import run_capture
         from recon.rig.capture import RecordingSettings
 
-        known = shared.settings().capture
+        known = shared.settings()
         limits = {"frames": frames, "seconds": seconds, "preview_every": preview}
-        settings = RecordingSettings.parse({**dict(known), **limits})
+        views = {"side_by_side": known.source.side_by_side}
+        settings = RecordingSettings.parse({**dict(known.capture), **views, **limits})
         devices = [left] if right is None else [left, right]
         with until_interrupted() as stopped:
             summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)

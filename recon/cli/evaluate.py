@@ -10,7 +10,12 @@ import typer
 from recon.cli import options as opt
 from recon.cli.errors import one_line_errors
 from recon.cli.options import Commands
-from recon.cli.tables import print_json, print_remarks, print_rows, print_summary
+from recon.cli.tables import (
+    print_json,
+    print_remarks,
+    print_rows,
+    print_summary,
+)
 
 app = Commands(name="evaluate", no_args_is_help=True, help="Compare results with ground truth.")
 
@@ -288,7 +293,7 @@ def paper(
         ),
     ] = None,
     as_printed: Annotated[
-        bool, opt.setting("paper.as_printed", "Also run the method as printed.", "--as-printed")
+        bool, opt.option("Also run the method as printed.", "--as-printed")
     ] = False,
     out: opt.Out = None,
     *,
@@ -309,5 +314,7 @@ def paper(
         from recon.commands.paper import run_paper
 
         settings = shared.settings(PAIR_DEFAULTS)
-        summary = run_paper(scenes, settings, out=out, threads=shared.threads)
+        summary = run_paper(
+            scenes, settings, out=out, threads=shared.threads, as_printed=as_printed
+        )
     shared.show(summary)

@@ -94,7 +94,16 @@ def settings(
     name: Annotated[
         str | None,
         typer.Argument(
-            help="A setting, a group such as matching.sgm, or a part of a name.", show_default="all"
+            help="A setting, a group such as matching.onnx, or a part of a name.",
+            show_default="all",
+        ),
+    ] = None,
+    preset: Annotated[
+        str | None,
+        opt.option(
+            "Print a preset, as a file for --config: fast, robot, survey, room or small.",
+            "--preset",
+            metavar="PRESET",
         ),
     ] = None,
     markdown: Annotated[bool, opt.option("Print the page docs/settings.md.", "--markdown")] = False,
@@ -106,15 +115,25 @@ def settings(
     Change one with --set name=value, several with --config FILE.
 
     Examples:
-      recon settings matching.sgm
+      recon settings matching.onnx
       recon settings voxel
+      recon settings --preset robot > robot.yaml
     """
     with one_line_errors(quiet=quiet):
         from dataclasses import asdict
 
-        from recon.commands.config import list_settings, settings_page
+        from recon.commands.config import (
+            list_settings,
+            preset_text,
+            preset_values,
+            settings_page,
+        )
 
+        text = None if preset is None else preset_text(preset)
         groups = list_settings(name)
+    if text is not None:
+        print_json(dict(preset_values(preset))) if json else typer.echo(text, nl=False)
+        return
     if json:
         print_json({"groups": [asdict(group) for group in groups]})
     elif markdown:

@@ -136,10 +136,14 @@ def map_(
             prior_from=prior,
         )
         if resume is not None:
-            options, settings = options.resumed(resume, shared.config, shared.changes)
+            options, settings = options.resumed(
+                resume, shared.config, shared.changes, preset=shared.preset
+            )
         elif into is not None:
             of_the_source = () if remove is not None else ("source",)
-            settings = run_settings(into, shared.config, shared.changes, of_the_source)
+            settings = run_settings(
+                into, shared.config, shared.changes, of_the_source, preset=shared.preset
+            )
         else:
             settings = shared.settings()
         if into is not None and remove is not None:
@@ -221,7 +225,7 @@ def merge(
         from recon.commands.config import run_settings
         from recon.commands.merge import run_merge
 
-        settings = run_settings(runs[0], shared.config, shared.changes)
+        settings = run_settings(runs[0], shared.config, shared.changes, preset=shared.preset)
         options = shared.options("merge", out, mesh=mesh)
         summary = run_merge(runs, settings, options, opt.survey_of(georeference, antenna))
     shared.show(summary)

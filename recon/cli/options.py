@@ -54,6 +54,15 @@ Config = Annotated[
     Path | None,
     option("YAML file with settings, such as the config.yaml of a run.", "--config", "-c"),
 ]
+Preset = Annotated[
+    str | None,
+    option(
+        "Settings chosen together: fast, robot, survey, room or small; --config and --set come "
+        "after it. recon settings --preset NAME shows them.",
+        "--preset",
+        metavar="NAME",
+    ),
+]
 Set = Annotated[
     list[str] | None,
     option(
@@ -146,6 +155,7 @@ class Asked:
     """What commands with settings take, last in their help."""
 
     config: Config = None
+    preset: Preset = None
     set_: Set = None
     json: Json = False
     quiet: Quiet = False
@@ -166,7 +176,7 @@ class Asked:
     def settings(self, defaults: Mapping[str, Any] | None = None) -> ReconConfig:
         from recon.commands.config import load_config
 
-        return load_config(self.config, self.changes, defaults)
+        return load_config(self.config, self.changes, defaults, preset=self.preset)
 
     def one_line_errors(self) -> AbstractContextManager[None]:
         return one_line_errors(quiet=self.quiet)

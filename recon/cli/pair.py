@@ -15,24 +15,15 @@ if TYPE_CHECKING:
     from recon.commands.config import ReconConfig
 
 
-def _disparities(ndisp: int) -> dict[str, int]:
-    """Return the settings of all matchers that have a number of disparities."""
-    from recon.stereo.match.registry import MatchingSettings
-
-    groups = {name: field.annotation for name, field in MatchingSettings.model_fields.items()}
-    ranged = (name for name, one in groups.items() if "ndisp" in getattr(one, "model_fields", ()))
-    return {f"matching.{name}.ndisp": ndisp for name in ranged}
-
-
 def _settings(shared: opt.Shared, ndisp: int | None) -> ReconConfig:
     """Return the configuration of one pair, whose matcher has a number of disparities if given."""
     from recon.commands.config import PAIR_DEFAULTS
     from recon.core.plugins import name_of
-    from recon.stereo.match.registry import settings_of
+    from recon.stereo.match.registry import settings_taken
 
     settings = shared.settings(PAIR_DEFAULTS)
     used = settings.matching.matcher
-    if ndisp is not None and not hasattr(settings_of(used, settings.matching), "ndisp"):
+    if ndisp is not None and "ndisp" not in settings_taken(used):
         what, got = "the matcher has no such setting", f"matcher {name_of(used)!r}"
         raise SettingsError(what, where="--ndisp", got=got)
     return settings
@@ -43,7 +34,7 @@ Right = Annotated[Path, typer.Argument(help="Right image.")]
 Ndisp = Annotated[
     int | None,
     opt.setting(
-        _disparities,
+        "matching.ndisp",
         "Number of disparities to search.",
         default="calibration, else estimated",
         min=1,

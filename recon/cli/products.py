@@ -72,7 +72,7 @@ def export(
 
         summary = run_export(
             run,
-            run_settings(run, shared.config, shared.changes),
+            run_settings(run, shared.config, shared.changes, preset=shared.preset),
             products=opt.names_in(to),
             formats=opt.names_in(formats) or ("ply",),
             out=out,
@@ -160,6 +160,6 @@ def occupancy(
         from recon.commands.config import run_settings
         from recon.commands.export import run_occupancy
 
-        settings = run_settings(run, shared.config, shared.changes)
+        settings = run_settings(run, shared.config, shared.changes, preset=shared.preset)
         summary = run_occupancy(run, settings, out=out, threads=shared.threads)
     shared.show(summary)

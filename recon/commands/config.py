@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
+import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
 from os import PathLike
 from pathlib import Path
+from textwrap import dedent
 from typing import Any, Final, Literal, get_args, get_origin
 
 from pydantic import model_validator
@@ -15,7 +20,7 @@ from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
 from recon.core.errors import FormatError, SettingsError
-from recon.core.plugins import name_of
+from recon.core.renamed import current_names
 from recon.core.settings import (
     Settings,
     alternatives,
@@ -24,7 +29,6 @@ from recon.core.settings import (
     merge,
     suggest_names,
 )
-from recon.evaluation.paper import PaperConfig
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings
 from recon.io.fields import parse_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
@@ -36,7 +40,7 @@ from recon.run.finished import is_pair_run
 from recon.run.run import CONFIG
 from recon.sources.settings import SourceSettings
 from recon.stereo.frame import ANY_SCALE
-from recon.stereo.match.registry import MATCHERS, field_of
+from recon.stereo.match.registry import plugin_groups, settings_taken
 from recon.street.settings import StreetSettings
 
 Changes = Sequence[str | Mapping[str, Any]]
@@ -47,9 +51,11 @@ _BYTES_PER_PIXEL: Final = 18
 """Two colour images, and the disparity with its confidence and deviation: the least of a pair."""
 
 
-class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfig):
+class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings):
     """Everything that determines a result; written beside each result as ``config.yaml``."""
 
+    preset: str | None = None
+    """What the others began with: a name in ``presets.yaml``."""
     source: SourceSettings = SourceSettings()
     capture: CaptureSettings = CaptureSettings()
     mesh: MeshSettings = MeshSettings()
@@ -78,12 +84,13 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings, PaperConfi
         every = _recorded(self, usual)
         groups = {name: every[name] for name in GROUPS.get(command, every) if name in every}
         if "matching" in groups:
-            used = {name_of(self.matching.matcher), self.matching.keyframe_matcher or ""}
-            unused = {field_of(name) for name in MATCHERS} - {field_of(name) for name in used}
-            groups["matching"] = {k: v for k, v in groups["matching"].items() if k not in unused}
+            kept = {"matcher", "keyframe_matcher"} | settings_taken(self.matching.matcher)
+            if self.matching.keyframe_matcher is not None:
+                kept |= settings_taken(self.matching.keyframe_matcher)
+            groups["matching"] = {k: v for k, v in groups["matching"].items() if k in kept}
         if self.street == usual[0].street:
             groups.pop("street", None)
-        return groups
+        return groups if self.preset is None else {"preset": self.preset, **groups}
 
 
 _FRAME: Final = ("source", "rectification", "matching", "cloud", "filters")
@@ -103,18 +110,17 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "calibrate": ("source", "rectification", "calibration"),
     "audit": ("source", "rectification", "matching", "audit"),
     "evaluate-middlebury": ("rectification", "matching"),
-    "paper": (*_FRAME, "mesh", "paper"),
+    "paper": (*_FRAME, "mesh"),
 }
 """The groups of settings that determine the result of each command."""
 
+REMADE: Final = ("occupancy", "grid", "ground", "robot", "submaps")
+"""Groups that may differ from those of a run where its rays are cast again."""
+
 PAIR_DEFAULTS: Final[Mapping[str, Any]] = {
-    "matching": {
-        "matcher": "fine",
-        **{name: {"fill": True} for name in ("sad", "sgm", "fine")},
-    },
+    "matching": {"matcher": "fine", "fill": "ours"},
     "cloud": {"min_range_m": 0.0, "max_range_m": None, "max_relative_sigma": None},
     "filters": ANY_SCALE.model_dump(),
-    "mesh": {"point_weight": 16.0},
 }
 """Defaults of a single pair that differ from a drive: the scale of its scene is unknown."""
 
@@ -123,33 +129,76 @@ def load_config(
     path: StrPath | Mapping[str, Any] | ReconConfig | None = None,
     overrides: Changes | Mapping[str, Any] = (),
     defaults: Mapping[str, Any] | None = None,
+    *,
+    preset: str | None = None,
 ) -> ReconConfig:
-    """Build the configuration; what comes later wins: defaults, file, overrides.
+    """Build the configuration; what comes later wins: defaults, preset, file, overrides.
 
     Keys of all mappings may be dotted or nested.
 
     Args:
         path: A YAML file with any part of the configuration, such as a run's ``config.yaml``; or
             its content as a mapping; or a configuration that is to be changed.
-        overrides: ``key=value`` texts with dotted keys, such as ``matching.sad.window_px=9``,
+        overrides: ``key=value`` texts with dotted keys, such as ``matching.window_px=9``,
             also several with commas; or mappings; or one of them.
         defaults: Defaults of a command that differ from those of the stages.
+        preset: Name of settings that are chosen together: fast, robot, survey, room or small; None
+            = that which the file names, if any.
 
     Raises:
         SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
     """
-    given = merge(_nested(defaults or {}), _nested(_values_of(path)))
-    values = given
+    own, notes = current_names(_nested(_values_of(path)))
+    named = own.get("preset") if preset is None else preset
+    chosen = {} if named is None else {"preset": named}
+    usual = merge(current_names(_nested(defaults or {}))[0], preset_values(named))
+    values = given = merge(merge(usual, own), chosen)
     for one in [overrides] if isinstance(overrides, str | Mapping) else overrides:
         # Several settings stand in one text with commas between.
         for part in map(_parse_override, _NEXT.split(one)) if isinstance(one, str) else [one]:
-            values = merge(values, _nested(part))
+            changed, old = current_names(_nested(part))
+            if changed.get("preset") is not None:
+                hint = "--preset NAME, or recon.load_config(preset=NAME)"
+                raise SettingsError("a preset is not one of the settings", got=part, hint=hint)
+            values, notes = merge(values, changed), [*notes, *old]
+    if notes:
+        warnings.warn("; ".join(dict.fromkeys(notes)), FutureWarning, stacklevel=2)
     try:
         return ReconConfig.parse(values)
     except SettingsError:
         if isinstance(path, str | PathLike):
             ReconConfig.parse(given, where=str(path))  # blames the file if it is invalid by itself
         raise
+
+
+def preset_values(name: str | None) -> Mapping[str, Any]:
+    """Return the nested values of a preset; None = no preset, no values."""
+    if name is None:
+        return {}
+    known: Mapping[str, Mapping[str, Any]] = parse_yaml(presets_text(), "presets.yaml")
+    if name not in known:
+        near = difflib.get_close_matches(str(name), known, n=1)
+        raise SettingsError(
+            "unknown preset",
+            where="--preset",
+            got=repr(name),
+            expected=f"one of: {', '.join(known)}",
+            hint=f"did you mean {near[0]}?" if near else "`recon settings --preset NAME` shows one",
+        )
+    return known[name]
+
+
+def preset_text(name: str) -> str:
+    """Return a preset as a file for ``--config``, with the lines that say for whom it is."""
+    preset_values(name)  # refuses an unknown name
+    block = presets_text().partition(f"\n{name}:\n")[2].partition("\n\n")[0]
+    return f"# recon's preset {name}\n{dedent(block.rstrip())}\n"
+
+
+@cache
+def presets_text() -> str:
+    """Return the file that has all presets."""
+    return files("recon.commands").joinpath("presets.yaml").read_text(encoding="utf-8")
 
 
 def _values_of(path: object) -> Mapping[str, Any]:
@@ -164,38 +213,54 @@ def _values_of(path: object) -> Mapping[str, Any]:
 
 
 def run_settings(
-    folder: Path, file: Path | None = None, overrides: Changes = (), without: Collection[str] = ()
+    folder: Path,
+    file: Path | None = None,
+    overrides: Changes = (),
+    without: Collection[str] = (),
+    *,
+    preset: str | None = None,
 ) -> ReconConfig:
     """Return the settings of a finished run of map, demo or pair, with changes.
 
-    The file comes before the overrides. The sections ``without`` are the defaults again, since
-    they are of its source.
+    The preset comes before the file, and that before the overrides; it changes only what a
+    finished run can be given. The sections ``without`` are the defaults again, since they are of
+    its source.
     """
     if is_pair_run(folder):
-        return load_config(file, overrides, PAIR_DEFAULTS)
+        return load_config(file, overrides, PAIR_DEFAULTS, preset=preset)
     try:
-        own = load_config(folder / CONFIG)
+        own = ReconConfig.parse(_nested(_read_yaml(folder / CONFIG)), where=str(folder / CONFIG))
     except SettingsError as error:
         what = f"the settings of this run are not valid in this version: {error.what}"
         how = {"where": error.where, "got": error.got, "hint": "map the drive again"}
         raise SettingsError(what, **how) from error
-    return load_config(file, overrides, own.model_dump(mode="json", exclude=set(without)))
+    known = own.model_dump(mode="json", exclude=set(without))
+    given = {*REMADE, "mesh", "memory"}
+    chosen = {group: part for group, part in preset_values(preset).items() if group in given}
+    known = merge(known, chosen if preset is None else {**chosen, "preset": preset})
+    return load_config(file, overrides, known)
 
 
 def check_changes(ran: ReconConfig, config: ReconConfig, sections: Collection[str]) -> None:
-    """Refuse settings that differ from those that a run had, but for those of some sections."""
-    for name in type(config).model_fields:
-        if name not in sections and getattr(config, name) != getattr(ran, name):
+    """Refuse settings that differ from those that a run had, but for those of some sections.
+
+    What a preset says of the others is no wish: the preset is for more than these sections.
+    """
+    own = ran.model_dump(mode="json", exclude={"preset"})
+    usual = ran if config.preset is None else load_config(None, (), own, preset=config.preset)
+    for name in {*type(config).model_fields} - {*sections, "preset"}:
+        value = getattr(config, name)
+        if value not in (getattr(ran, name), getattr(usual, name)):
             what = "this setting has no effect here: the drive is not mapped again"
             expected = f"settings of {', '.join(sections)}"
             raise SettingsError(what, got=name, expected=expected, hint="recon map takes it")
 
 
-def _recorded(settings: Settings, usual: Sequence[Settings]) -> dict[str, Any]:
+def _recorded(settings: Settings, usual: Sequence[Settings | None]) -> dict[str, Any]:
     """Return plain values, without what is open here and in the usual settings."""
     plain = settings.model_dump(mode="json")
     for name in type(settings).model_fields:
-        value, others = getattr(settings, name), [getattr(other, name) for other in usual]
+        value, others = getattr(settings, name), [getattr(one, name, None) for one in usual]
         if isinstance(value, Settings):
             plain[name] = _recorded(value, others)
         if plain[name] == {} or (value is None and all(other is None for other in others)):
@@ -297,7 +362,9 @@ class SettingGroup:
 
 def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:
     """List the settings of a dotted name or part of one, and all below it; None = all."""
-    every = tuple(_groups(ReconConfig(), ReconConfig.parse(PAIR_DEFAULTS)))
+    brought: dict[str, Any] = {"matching": {name: {} for name in plugin_groups()}}
+    drive, pair = ReconConfig.parse(brought), ReconConfig.parse(merge(brought, PAIR_DEFAULTS))
+    every = tuple(_groups(drive, pair))
     names = [entry.name for group in every for entry in group.settings]
     if name is None:
         return every
@@ -315,6 +382,7 @@ def list_settings(name: str | None = None) -> tuple[SettingGroup, ...]:
 def settings_page(groups: Sequence[SettingGroup]) -> str:
     """Return the page docs/settings.md."""
     lines = ["# Settings", "<!-- Written by `recon settings --markdown`. -->", _INTRODUCTION]
+    lines += ["", "## Presets", "```yaml", presets_text().rstrip("\n"), "```"]
     for group in groups:
         lines += ["", f"## {group.name}", group.purpose, ""]
         lines += ["| setting | default | values | what it does |", "|---|---|---|---|"]
@@ -341,7 +409,7 @@ def _groups(
             unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
             values = (_as_yaml(value), _as_yaml(paired), unit, _values(field))
             own.append(SettingEntry(name, *values, text, follows_scene(field)))
-    if own:
+    if own and prefix:  # not the name of a preset
         about = purpose or (type(drive).__doc__ or "").partition("\n")[0].replace("``", "`")
         yield SettingGroup(prefix.removesuffix("."), about, tuple(own))
     for group in inside:

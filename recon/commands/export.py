@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shutil import copyfile
-from typing import Any, Final
+from typing import Any
 
 from recon.commands.config import (
+    REMADE,
     Changes,
     ReconConfig,
     check_changes,
@@ -43,9 +44,6 @@ from recon.run.finished import (
     refuse_as_target,
 )
 from recon.run.run import Run
-
-REMADE: Final = ("occupancy", "grid", "ground", "robot", "submaps")
-"""Sections of the configuration that may differ from those of the run where rays are cast."""
 
 
 def run_export(
@@ -173,7 +171,9 @@ def export_map(
     moved, kept = [*map(Path, images)], opened.store.path
     check_target(product, path, () if kept is None else [kept])
     known = opened.first.info.config
-    ran = load_config({name: known[name] for name in ReconConfig.model_fields if name in known})
+    ran = ReconConfig.parse(
+        {name: known[name] for name in ReconConfig.model_fields if name in known}
+    )
     ran = ran.at_scale(ran.scale)
     settings = load_config(ran, changes)
     check_changes(ran, settings, (*(REMADE if need_rays([product]) else ()), "mesh"))

@@ -136,7 +136,7 @@ class MapOptions:
         )
 
     def resumed(
-        self, folder: Path, file: Path | None, changes: Changes
+        self, folder: Path, file: Path | None, changes: Changes, *, preset: str | None = None
     ) -> tuple[Self, ReconConfig]:
         """Complete the options by those of the unfinished run in a folder; and its settings.
 
@@ -146,7 +146,7 @@ class MapOptions:
         earlier = self.of(started["arguments"])
         if earlier.mesh and not self.mesh:
             raise SettingsError("the run was started with a mesh", hint="drop --no-mesh")
-        settings = load_config(file, changes, started["identity"]["config"])
+        settings = load_config(file, changes, started["identity"]["config"], preset=preset)
         now = {"config": settings.model_dump(mode="json")}
         _refuse_others(now, started["identity"], folder)
         given = {

@@ -14,8 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.commands.config import ReconConfig, check_changes, run_settings
-from recon.commands.export import REMADE
+from recon.commands.config import REMADE, ReconConfig, check_changes, run_settings
 from recon.commands.map import look_first, map_drive
 from recon.commands.map_options import MapOptions
 from recon.commands.map_summary import JoinedDrive, JoinedSummary, LinkFigures, UsualProducts

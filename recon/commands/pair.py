@@ -52,7 +52,8 @@ from recon.stereo.match.registry import (
     MatchingSettings,
     check_matcher,
     field_of,
-    settings_of,
+    plugin_groups,
+    settings_taken,
 )
 from recon.stereo.match.search import SearchSettings
 
@@ -215,7 +216,8 @@ def match(
             A value, or a file that `read_calibration` understands.
         matcher: Name of the matcher, one of recon's or one that an installed package registers;
             or any object with the methods of `Matcher`.
-        **settings: Settings of a matcher of recon's, such as ``ndisp=64`` or ``window_px=9``.
+        **settings: Settings of the matcher, such as ``ndisp=64`` or ``window_px=9``; of a plug-in,
+            those that it brings.
 
     Raises:
         ShapeError: The images differ in size.
@@ -270,14 +272,17 @@ def _rig_of(calibration: Calibration, pair: StereoPair) -> _Rig:
 
 
 def _own_settings(matcher: str | Matcher, settings: Mapping[str, Any]) -> dict[str, Any]:
-    if isinstance(matcher, str) and matcher in MATCHERS:
-        return {f"matching.{field_of(matcher)}.{name}": value for name, value in settings.items()}
-    if settings:
-        check_matcher(matcher)
-        where, hint = f"matcher {name_of(matcher)!r}", "make the object with them"
-        what = "only recon's own matchers take settings"
-        raise SettingsError(what, where=where, got=", ".join(settings), hint=hint)
-    return {}
+    """Return the settings of a matcher by their dotted names; those that it does not have fail."""
+    if not settings:
+        return {}
+    check_matcher(matcher)
+    taken, group = settings_taken(matcher), field_of(name_of(matcher))
+    if isinstance(matcher, str) and (matcher in MATCHERS or group in plugin_groups([matcher])):
+        shared = taken & {*SearchSettings.model_fields}
+        return {f"matching.{'' if n in shared else f'{group}.'}{n}": v for n, v in settings.items()}
+    where, hint = f"matcher {name_of(matcher)!r}", "make the object with them"
+    what = "this matcher takes no settings here"
+    raise SettingsError(what, where=where, got=", ".join(settings), hint=hint)
 
 
 def _figures(
@@ -309,25 +314,18 @@ def _figures(
 
 
 def _idle(matching: MatchingSettings) -> tuple[str, ...]:
-    """Return warnings of changed settings of matchers that are not used; the range is for all."""
-    if not isinstance(settings_of(matching.matcher, matching), SearchSettings):
-        return ()  # the range of such a matcher is that of `sad`
-    used = field_of(name_of(matching.matcher))
-    others = dict.fromkeys(field_of(each) for each in MATCHERS if field_of(each) != used)
-
-    def changed(usual: Mapping[str, Any]) -> list[str]:
-        found = []
-        for name in others:
-            own: Any = getattr(matching, name)
-            same = {"ndisp": own.ndisp} if isinstance(own, SearchSettings) else {}
-            if own != type(own).parse({**usual.get(name, {}), **same}):
-                found.append(name)
-        return found
-
-    # In Python a configuration may begin with the defaults of drives.
-    named = min(changed(PAIR_DEFAULTS["matching"]), changed({}), key=len)
-    advice = f"the matcher is {used} (--matcher chooses another)"
-    return tuple(f"the settings of matching.{one} have no effect: {advice}" for one in named)
+    """Return warnings of settings that were changed and that the matcher does not have."""
+    # The range is searched by what supports the pair, too, whatever matches it.
+    used = {"matcher", "keyframe_matcher", "fill", "ndisp", "min_disparity_px"}
+    taken = settings_taken(matching.matcher) | used
+    usual = type(matching)()
+    idle = [
+        name
+        for name in type(matching).model_fields
+        if name not in taken and getattr(matching, name) != getattr(usual, name)
+    ]
+    advice = f"the matcher is {name_of(matching.matcher)} (--matcher chooses another)"
+    return tuple(f"matching.{one} has no effect: {advice}" for one in idle)
 
 
 def _cloud_figures(frame: ReconstructedFrame) -> PairCloud:

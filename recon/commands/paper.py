@@ -32,6 +32,7 @@ def run_paper(
     *,
     out: Path | None = None,
     threads: int | None = None,
+    as_printed: bool = False,
 ) -> PaperSummary:
     """Repeat experiments 2 to 4 of the seed paper: what `recon paper` does.
 
@@ -39,11 +40,11 @@ def run_paper(
     truth where there is one. Maps, clouds and a report go to the result folder.
 
     ``folder`` holds the scenes ArtL, Jadeplant and Pipes; None = MiddEval3's trainingQ in the
-    folder that ``RECON_DATA`` names. ``paper`` of the settings selects methods and patch sizes.
+    folder that ``RECON_DATA`` names. ``as_printed`` adds the method as the paper has it.
     """
     config = config or load_config(defaults=PAIR_DEFAULTS)
     experiments = read_experiments(folder)
-    methods = tuple(TITLES) if config.paper.as_printed else (CORRECTED,)
+    methods = tuple(TITLES) if as_printed else (CORRECTED,)
     source = experiments[0].files[0].parents[1]
     with Run("paper", out, config, threads=threads) as run:
         figures, done = {}, []
@@ -63,7 +64,7 @@ def run_paper(
                 patches=tried,
             )
         summary = PaperSummary(
-            as_printed=config.paper.as_printed,
+            as_printed=as_printed,
             table_1=[table_1_row(one) for one in experiments],
             experiments=figures,
             warnings=[

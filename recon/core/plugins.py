@@ -26,7 +26,7 @@ class Plugins:
     def check(self, given: object, ours: Collection[str] = ()) -> None:
         """Refuse an unknown name, and an object that is none, without making anything."""
         if isinstance(given, str):
-            if given not in ours and given not in (others := entry_points(group=self.group).names):
+            if given not in ours and given not in (others := self.names()):
                 choices = ", ".join(sorted({*ours, *others}))
                 what = f"unknown {self.kind}"
                 raise SettingsError(what, got=repr(given), expected=f"one of: {choices}")
@@ -38,30 +38,45 @@ class Plugins:
             what, expected = f"not usable as {self.kind}", f"a name, or {self._expected}"
             raise SettingsError(what, got=type(given).__name__, expected=expected)
 
-    def load(self, given: str | object) -> Any:
+    def names(self) -> Collection[str]:
+        """Return the names that installed packages register, without loading anything."""
+        return entry_points(group=self.group).names
+
+    def registered(self, name: str) -> Any:
+        """Return what a package registers, usually a class, before anything is made of it."""
+        with calling(SettingsError, "the plug-in does not load", where=self._origin(name)):
+            return self._point(name).load()
+
+    def load(self, given: str | object, *arguments: object) -> Any:
         """Return an object as it is, and make that of a name which a package registers."""
         if not isinstance(given, str):
             return given
-        found = entry_points(group=self.group, name=given)
-        point, *others = sorted(found, key=_origin)
-        origin = f"{self.kind} {given!r} ({_origin(point)})"
-        if others:
-            raise SettingsError(
-                "two plug-ins have the same name",
-                where=f"{self.kind} {given!r}",
-                got=" and ".join(map(_origin, (point, *others))),
-                hint="uninstall one of them",
-            )
+        origin, make = self._origin(given), self.registered(given)
         with calling(SettingsError, "the plug-in does not load", where=origin):
-            made = point.load()()
+            made = make(*arguments)
         if inspect.isclass(made) or not self._fits(made):
             raise SettingsError(
                 f"the plug-in makes no {self.kind}",
                 where=origin,
                 got=type(made).__name__,
-                expected=f"a class or function that takes no argument and gives {self._expected}",
+                expected="a class or function that takes no argument, or the settings that it "
+                f"brings, and gives {self._expected}",
             )
         return made
+
+    def _origin(self, name: str) -> str:
+        return f"{self.kind} {name!r} ({_origin(self._point(name))})"
+
+    def _point(self, name: str) -> EntryPoint:
+        point, *others = sorted(entry_points(group=self.group, name=name), key=_origin)
+        if others:
+            raise SettingsError(
+                "two plug-ins have the same name",
+                where=f"{self.kind} {name!r}",
+                got=" and ".join(map(_origin, (point, *others))),
+                hint="uninstall one of them",
+            )
+        return point
 
     @property
     def _expected(self) -> str:

@@ -33,6 +33,11 @@ def Length(road_m: float, *, ge: float, le: float) -> Any:
     return Field(road_m, ge=ge, le=le, json_schema_extra=dict(_FOLLOWS))
 
 
+def scaled(road_m: float, scale: float) -> float:
+    """Return a length on a road at another scale, as short as it can be written."""
+    return float(f"{scale * road_m:.9g}")
+
+
 def follows_scene(field: FieldInfo) -> bool:
     """Return whether a field is a `Length`."""
     return field.json_schema_extra == _FOLLOWS
@@ -92,7 +97,7 @@ class Settings(BaseModel):
             if isinstance(value, Settings):
                 found[name] = value.at_scale(scale)
             elif follows_scene(field) and name not in self.model_fields_set:
-                found[name] = float(f"{scale * value:.9g}")
+                found[name] = scaled(value, scale)
         return self.model_copy(update=found)
 
     def recorded(self, command: str) -> dict[str, Any]:

@@ -7,13 +7,11 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import numpy as np
-from pydantic import Field, field_validator
 
 from recon.core.errors import CalibrationError, MatchingError, SourceError
-from recon.core.settings import Settings
 from recon.core.summary import Figures, Rows, RunSummary
 from recon.core.text import counted
 from recon.core.values import (
@@ -33,7 +31,7 @@ from recon.evaluation.disparity import evaluate_disparity
 from recon.io.middlebury import read_middlebury_calib, read_middlebury_scene
 from recon.stereo.frame import CloudSettings, FrameReconstructor, StereoSettings, back_project
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.sad import SadMatcher, SadSettings
+from recon.stereo.match.sad import SadMatcher
 from recon.stereo.match.search import usual_ndisp
 from recon.stereo.rectify.rectifier import Rectifier, to_grey
 
@@ -51,31 +49,8 @@ _WHERE: Final = "name the folder MiddEval3/trainingQ of the Middlebury benchmark
 _SIGMA_PX: Final = 1 / math.sqrt(12)  # of what is rounded to whole pixels
 # Keeps every point of the printed method, regardless of range and uncertainty.
 _EVERY_POINT: Final = CloudSettings(min_range_m=0.0, max_range_m=None, max_relative_sigma=None)
+PATCHES_PX: Final = tuple(range(3, 22, 2))  # of patches, and of windows of `sad`, to compare
 _PATCH_PX: Final = 11  # of the printed method; the paper does not give it
-
-
-class PaperSettings(Settings):
-    """How the seed paper's experiments are repeated."""
-
-    as_printed: bool = False
-    """Run the method as printed as well as the corrected one."""
-    patches_px: tuple[Annotated[int, Field(ge=1, le=61)], ...] = Field(
-        tuple(range(3, 22, 2)), min_length=1
-    )
-    """Patch sizes, and window sizes of the matcher `sad`, to compare; odd."""
-
-    @field_validator("patches_px")
-    @classmethod
-    def _are_odd(cls, value: tuple[int, ...]) -> tuple[int, ...]:
-        if any(patch % 2 == 0 for patch in value):
-            raise ValueError("a patch is an odd number from 1 to 61")
-        return value
-
-
-class PaperConfig(StereoSettings):
-    """Settings of `recon paper`, which corrects the printed method with ours."""
-
-    paper: PaperSettings = PaperSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,7 +253,7 @@ def table_1_row(experiment: Experiment) -> dict[str, Any]:
 
 
 def apply_method(
-    method: str, experiment: Experiment, config: PaperConfig, threads: int | None = None
+    method: str, experiment: Experiment, config: StereoSettings, threads: int | None = None
 ) -> MethodResult:
     """Reconstruct one experiment by one method.
 
@@ -307,20 +282,20 @@ def apply_method(
 
 
 def try_patches(
-    method: str, experiment: Experiment, config: PaperConfig, threads: int | None = None
+    method: str, experiment: Experiment, config: StereoSettings, threads: int | None = None
 ) -> list[PatchFigures]:
-    """Run a method with each patch size in the settings; ``corrected`` uses the matcher `sad`."""
+    """Run a method with patches of each size; ``corrected`` uses the matcher `sad`."""
     if method == CORRECTED:
         pair = Rectifier(experiment.camera, config.rectification).rectify(experiment.pair)
     else:
         pair = _printed_pair(experiment)
     figures = []
-    for patch_px in config.paper.patches_px:
+    for patch_px in PATCHES_PX:
         if patch_px <= min(pair.left.shape):
             matcher: Matcher = PrintedMatcher(patch_px, method == AS_PRINTED)
             if method == CORRECTED:
-                own = {**config.matching.sad.model_dump(), "window_px": patch_px}
-                matcher = SadMatcher(SadSettings.parse(own), threads)
+                own = config.matching.model_copy(update={"window_px": patch_px})
+                matcher = SadMatcher(own, threads)
             figures.append(_patch_figures(patch_px, matcher.match(pair), experiment.truth))
     return figures
 

@@ -49,8 +49,8 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
     """Return costs of the middle of the robot of the settings, and what a user should know.
 
     Raises:
-        MappingError: A drive kept no rays, or the robot is lower than what counts as ground, or
-            wider than a tile.
+        MappingError: A drive kept no rays, the robot is wider than a tile, or the band of heights
+            (`GridSettings`) is empty.
     """
     robot, band, observations = (
         placed.tiles.config.robot,
@@ -66,13 +66,6 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
             got=f"robot.width_m={robot.width_m:g}",
             expected=f"at most submaps.tile_m={tile_m:g}",
             hint="set robot.width_m to that of the robot, or map with larger tiles",
-        )
-    if robot.clearance_m <= band.min_height_m:
-        raise MappingError(
-            "the robot is not higher than what may be ground",
-            got=f"robot.clearance_m={robot.clearance_m:g}",
-            expected=f"more than grid.min_height_m={band.min_height_m:g}",
-            hint="set both; a lower band takes smaller cells (occupancy.resolution_m)",
         )
     seen = steep = 0
     focal_px = min(session.camera.focal_px for session in map_.linked)
@@ -93,8 +86,7 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
         driven.ravel()[cell[inside]] = True
         return widened(costs(relief, steps, slopes, robot, grid), robot, driven)
 
-    settings = band.model_copy(update={"max_height_m": robot.clearance_m})
-    grid, _, warnings = Flattening(placed, settings, finish).grid()
+    grid, _, warnings = Flattening(placed, band, finish).grid()
     if 2 * steep > seen:
         ratio, limit = f"{100 * steep / seen:.0f} %", f"{robot.max_slope_percent:g}"
         level = "is the map level (z up)? An inertial unit levels it"

@@ -219,11 +219,12 @@ class Flattening:
 
     def _ground(self, key: TileKey, settings: GroundSettings) -> GroundSurface | None:
         """Return the ground of a tile and its margin; None without a path nearby."""
-        area = self._tiles.bounds(key).wider(settings.reach_m)
+        reach_m = self._config.occupancy.max_range_m
+        area = self._tiles.bounds(key).wider(reach_m)
         path_m = area.path(self._path_m)
         if not len(path_m):
             return None
-        return estimate_ground_surface(self._ground_points(area), path_m, settings)
+        return estimate_ground_surface(self._ground_points(area), path_m, settings, reach_m)
 
     def _ground_points(self, area: Rectangle) -> PointCloud:
         """Return points in which ground is looked for: those of the cloud, and floors of voxels."""
@@ -243,7 +244,7 @@ class Flattening:
         for key in self._crossed(0.0):
             area = self._tiles.bounds(key)
             cloud, path_m = self._ground_points(area), area.path(self._path_m)
-            height, along = measure_camera_height(cloud, path_m, settings)
+            height, along = measure_camera_height(cloud, path_m, self._config.occupancy.max_range_m)
             drops.append(along)
             if math.isfinite(height):
                 known.append(height)

@@ -31,6 +31,7 @@ from recon.export.mesh.pieces import MeshFigures
 
 PAIR_CLOUD: Final = "clouds/cloud.ply"
 _PHOTO: Final = "left.png"  # the left image, beside the mesh
+_POINT_WEIGHT: Final = 16.0  # of Poisson's surface: the points of a pair are not means of many
 
 
 def mesh_frame(
@@ -49,10 +50,10 @@ def _surface(
     cloud: PointCloud, camera: RectifiedCamera, settings: MeshSettings, image: UInt8 | None
 ) -> TriangleMesh:
     """Mesh the cloud of a pair, and colour it by the left image if that is known."""
-    if settings.pair_surface == "grid":
+    if settings.surface == "grid":
         mesh = mesh_grid(cloud, camera, settings)
     else:
-        mesh = reconstruct_mesh(cloud, settings, viewpoint_m=(0.0, 0.0, 0.0))
+        mesh = reconstruct_mesh(cloud, settings, (0.0, 0.0, 0.0), point_weight=_POINT_WEIGHT)
     if image is None:
         return mesh
     u, v, _ = project(mesh.vertices, camera)

@@ -16,8 +16,7 @@ from recon.look.rig import LATER, MOST_TIME_OFFSET, MOVES, RefinedRig
 from recon.look.sample import BLANK_DN, MIN_FEATURES, Gaps, Sample
 from recon.look.settings import AuditedSettings
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.registry import MatchingSettings, settings_of
-from recon.stereo.match.search import SearchSettings
+from recon.stereo.match.registry import MatchingSettings, settings_taken
 
 Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
@@ -205,9 +204,9 @@ def _of_rig(rig: RefinedRig, disparity_px: Float64) -> Found:
 def _of_range(disparity_px: Float64, matching: MatchingSettings, camera: RectifiedCamera) -> Found:
     if len(disparity_px) < MIN_FEATURES:
         return
-    own, reach_px = settings_of(matching.matcher, matching), None
-    if isinstance(own, SearchSettings) and not (own.ndisp is None and camera.ndisp is None):
-        reach_px = own.min_disparity_px + own.ndisp_for(camera)  # else the range adapts to pairs
+    adapts, reach_px = matching.ndisp is None and camera.ndisp is None, None
+    if not adapts and "ndisp" in settings_taken(matching.matcher):
+        reach_px = matching.min_disparity_px + matching.ndisp_for(camera)
     scale = camera.focal_px * camera.baseline_m
     # A matcher's disparity is in image columns, without doffs.
     columns_px = disparity_px - camera.doffs_px

@@ -129,7 +129,8 @@ class OccupancySettings(Settings):
     resolution_m: float = Length(0.2, ge=1e-06, le=1000.0)
     """Edge of a voxel, and of a cell of the grid. Half of it takes about six times the memory."""
     max_range_m: float = Length(25.0, ge=1e-06, le=100000.0)
-    """Points farther away hit nothing. Less for short baselines, more for long ones."""
+    """Points farther away hit nothing, and so far from the path the ground is followed and the grid
+    reaches. Less for short baselines, more for long ones."""
     keep_rays: bool = True
     """Keep the rays of every frame in the run's folder, for recon occupancy. Off saves 0.2 to 0.3
     MB per frame."""

@@ -21,7 +21,7 @@ from recon.core.values import OccupancyVoxels
 from recon.core.values.arrays import Bool, Float64, Int64, tree_of
 from recon.map.builders import Submap
 from recon.map.fusion import ALL, FusedPart, row_bytes
-from recon.map.ground.grid import JOINED_CELLS
+from recon.map.ground.grid import JOINED_CELLS, MIN_BLOB_CELLS
 from recon.map.kernels.raycast import BLOCK_BITS, BLOCK_EDGE
 from recon.map.occupancy.moving import GROWTH_CELLS
 from recon.map.occupancy.part import OccupancyPart
@@ -102,13 +102,12 @@ class Cutter:
 
     def __init__(self, config: DriveSettings, T_map_world: Float64, halvings: int = 0) -> None:
         self._config, self._T_map_world = config, T_map_world
-        resolution_m, filters = config.occupancy.resolution_m, config.map_filters
+        resolution_m = config.occupancy.resolution_m
         # A power of two, so that a tile is a branch of an octree.
         cells = round(math.log2(config.submaps.tile_m / resolution_m))
         self.edge_cells = 1 << max(BLOCK_BITS, cells - halvings)
         self.edge_m = self.edge_cells * resolution_m
-        margin_m = max(2 * (filters.voxel_m or 0.0), filters.radius_m or 0.0)
-        margin_m = max(config.scale * _FILTER_MARGIN_M, margin_m)
+        margin_m = max(config.scale * _FILTER_MARGIN_M, config.map_filters.radius_m or 0.0)
         # A voxel more, since a point may lie anywhere in its voxel; and whether a point moved
         # depends on the points in the voxels that touch those through which it may have grown, at
         # the sides and then twice below.
@@ -116,16 +115,14 @@ class Cutter:
         self._filter_margin_m = margin_m + config.fusion.voxel_m + beyond * resolution_m
         # A cell of a grid depends on the cells joined to it, on their blob, on as many around them,
         # and on adjacent cells; and a surface in a block on the blocks that touch it.
-        beyond = config.grid.min_blob_cells + 2 * JOINED_CELLS + 1 + BLOCK_EDGE
+        beyond = MIN_BLOB_CELLS + 2 * JOINED_CELLS + 1 + BLOCK_EDGE
         beyond = max(beyond, math.ceil(self._filter_margin_m / resolution_m) + 1)
         # What the middle of a robot costs depends on what it is fitted to, half of its width away
         # from where its sides are. One wider than a tile, as on a table, has no costmap.
         if config.robot.width_m <= config.submaps.tile_m:
             beyond = max(beyond, math.ceil(config.robot.width_m / resolution_m) + 3)
         self.grid_margin_m = math.ceil(beyond / BLOCK_EDGE) * BLOCK_EDGE * resolution_m
-        least_m = max(
-            config.scale * _LEAST_TILE_M, margin_m, config.grid.min_blob_cells * resolution_m
-        )
+        least_m = max(config.scale * _LEAST_TILE_M, margin_m, MIN_BLOB_CELLS * resolution_m)
         small = self.edge_m < 2 * least_m or self.edge_cells == BLOCK_EDGE
         self.limit_bytes = None if small else config.memory.tile_bytes
 

@@ -19,7 +19,7 @@ from recon.map.kernels.raycast import BLOCK_EDGE
 from recon.odometry.protocol import Odometry
 from recon.odometry.registry import check_odometry
 from recon.odometry.settings import OdometrySettings, RigSettings
-from recon.stereo.frame import FilterSettings, StereoSettings
+from recon.stereo.frame import StereoSettings
 
 SCALES: Final = (1e-5, 1e3)
 
@@ -33,12 +33,12 @@ class SceneSettings(Settings):
     0.2. Give two drives that are to share a map the same."""
 
 
-class MapFilterSettings(FilterSettings):
-    """Which filters are applied to the fused cloud, in this order; none turns one off."""
+class MapFilterSettings(Settings):
+    """What is dropped from the fused cloud."""
 
     radius_m: float | None = Length(0.3, ge=1e-06, le=1000000.0)
     """Points with fewer than two others within this radius are dropped. About three voxels; larger
-    drops larger islands."""
+    drops larger islands; none = keep all."""
 
 
 class CheckpointSettings(Settings):
@@ -97,15 +97,11 @@ class DriveSettings(StereoSettings):
     @model_validator(mode="after")
     def _check_margins(self) -> Self:
         """Refuse margins wider than a tile: each tile would be made of all those around it."""
-        resolution_m, filters = self.occupancy.resolution_m, self.map_filters
-        tile_m = max(self.submaps.tile_m, BLOCK_EDGE * resolution_m)
-        for name, reach_m in (
-            ("map_filters.voxel_m", 2 * (filters.voxel_m or 0.0)),
-            ("map_filters.radius_m", filters.radius_m or 0.0),
-            ("grid.min_blob_cells", self.grid.min_blob_cells * resolution_m),
-        ):
-            if reach_m > tile_m:
-                raise ValueError(
-                    f"{name} reaches {reach_m:g} m, beyond a tile of {tile_m:g} m (submaps.tile_m)"
-                )
+        tile_m = max(self.submaps.tile_m, BLOCK_EDGE * self.occupancy.resolution_m)
+        reach_m = self.map_filters.radius_m or 0.0
+        if reach_m > tile_m:
+            raise ValueError(
+                f"map_filters.radius_m reaches {reach_m:g} m, beyond a tile of {tile_m:g} m "
+                "(submaps.tile_m)"
+            )
         return self

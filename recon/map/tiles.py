@@ -32,7 +32,7 @@ from recon.map.occupancy.bodies import FrameObservations
 from recon.map.occupancy.moving import CellEvidence, cell_evidence, find_moved
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
-from recon.stereo.frame import filter_cloud
+from recon.stereo.frame import drop_islands
 
 _POINTS: Final = "points"
 _VOXELS: Final = "voxels"
@@ -244,7 +244,7 @@ class Tiles:
                 moved = find_moved(points, sigma_m, counted, voxels, evidence, self.observations)
             kept.append(fused.select(~moved))
             removed.append(fused.select(moved))
-        cloud = filter_cloud(self._exported(kept), self.config.map_filters)
+        cloud = drop_islands(self._exported(kept), self.config.map_filters.radius_m)
         return self._placed(key, cloud), self._placed(key, self._exported(removed))
 
     def _exported(self, parts: Iterable[FusedPart]) -> PointCloud:

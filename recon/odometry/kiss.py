@@ -23,6 +23,7 @@ from recon.core.values.camera import depth_from_disparity, depth_sigma, unprojec
 from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.odometry.visual import VisualOdometry
 
+RANGE_M: Final = 30.0  # on a road: farther points are not registered, stereo places them badly
 _RANGE_IN_VOXELS: Final = 100.0
 """Range relative to the edge of a voxel, by kiss-icp's own rule. Of 30 m this gives 0.3 m: points
 are as uncertain, and with 0.2 m paths are the same and take twice the time."""

@@ -35,6 +35,9 @@ from recon.odometry.visual import VisualOdometry
 _CAMERA_FROM_BODY: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Camera axes (x right, y down, z forward) of body axes (x forward, y left, z up)."""
 
+_MAX_GAP_S: Final = 1.0
+"""Poses farther apart in time are not interpolated: a vehicle brakes or turns within it."""
+
 
 @dataclass(frozen=True, eq=False)
 class MotionPrior:
@@ -58,7 +61,7 @@ class MotionPrior:
         raise RegistrationError(
             "the prior does not cover the drive",
             got=f"poses from {spans[0]}",
-            expected=f"frames from {spans[1]}, poses at most {self.settings.max_gap_s:g} s apart",
+            expected=f"frames from {spans[1]}, poses at most {_MAX_GAP_S:g} s apart",
             hint="both must use the same clock, in seconds",
         )
 
@@ -98,7 +101,7 @@ class MotionPrior:
         if times_s[after] == time_s:
             return T_after
         gap_s = times_s[after] - times_s[after - 1]
-        if gap_s > self.settings.max_gap_s:
+        if gap_s > _MAX_GAP_S:
             return None
         T_before = self.path.T_world_camera[after - 1]
         ratio = float((time_s - times_s[after - 1]) / gap_s)

@@ -11,21 +11,23 @@ from pydantic import TypeAdapter, ValidationError
 from recon.core.errors import FormatError, RegistrationError, SettingsError
 from recon.core.geometry.se3 import check_rigid, invert, orthonormalise
 from recon.core.plugins import Plugins, calling, kind_of, name_of
+from recon.core.settings import scaled
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.guide import Guide
-from recon.odometry.kiss import KissOdometry
+from recon.odometry.kiss import RANGE_M, KissOdometry
 from recon.odometry.prior import MotionPrior
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult, pose_in
 from recon.odometry.settings import OdometrySettings
 from recon.odometry.visual import VisualOdometry
 
-ODOMETRIES: Final[dict[str, Callable[[OdometrySettings, Guide | None], Odometry]]] = {
-    "visual": lambda settings, guide: VisualOdometry(guide),
-    "kiss": lambda settings, guide: KissOdometry(settings.max_range_m, VisualOdometry(guide)),
+ODOMETRIES: Final[dict[str, Callable[[float, Guide | None], Odometry]]] = {
+    "visual": lambda _, guide: VisualOdometry(guide),
+    "kiss": lambda scale, guide: KissOdometry(scaled(RANGE_M, scale), VisualOdometry(guide)),
 }
+"""What makes each odometry, of the scale of the scene and what says how the rig moves."""
 
 
 def make_odometry(
@@ -55,7 +57,7 @@ def make_odometry(
         return CheckedOdometry(made, scale)
     settings = settings or OdometrySettings()
     guide = guide if prior is None else MotionPrior(prior, settings.prior)
-    return CheckedOdometry(ODOMETRIES[odometry](settings, guide), scale)
+    return CheckedOdometry(ODOMETRIES[odometry](scale, guide), scale)
 
 
 def check_odometry(odometry: str | Odometry) -> None:

@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field, InstanceOf, field_serializer
 
 from recon.core.plugins import name_of
-from recon.core.settings import Length, Settings
+from recon.core.settings import Settings
 from recon.odometry.protocol import Odometry
 
 
@@ -18,8 +18,6 @@ class PriorSettings(Settings):
     """Axes of its poses: of the left camera (x right, y down, z forward), or of a body (x forward,
     y left, z up) that turns with it and is near to it. auto = those in which it explains what
     the cameras see on the first metres."""
-    max_gap_s: float = Field(1.0, ge=1e-06, le=1000000.0)
-    """Poses farther apart in time are not interpolated. Raise it for a slow receiver."""
     sigma_m: float = Field(0.03, ge=1e-06, le=1000000.0)
     """Standard deviation of its motion from frame to frame. State here what your sensor is worth:
     the cameras are believed where it is worse."""
@@ -50,9 +48,6 @@ class OdometrySettings(Settings):
     """Use the inertial unit of a source that has one, without `--prior`: its gyro says how the
     camera turns, also where it sees nothing, its accelerometer what is up. Its bias, delay and axes
     are found from the drive."""
-    max_range_m: float = Length(30.0, ge=1e-06, le=100000.0)
-    """Points farther than this are not registered by kiss-icp (`kiss`, and `recon localize`). Raise
-    it with a wide baseline in open country."""
     prior: PriorSettings = PriorSettings()
 
     @field_serializer("method")

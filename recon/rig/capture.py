@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -31,7 +31,7 @@ from recon.io.images.image import write_image
 from recon.io.trajectory import FRAMES, HEADER, CapturedFrame
 from recon.sources.calibration import CALIBRATE, read_rig
 from recon.sources.live import Camera
-from recon.sources.settings import SourceSettings
+from recon.sources.settings import SideBySide, SourceSettings
 from recon.sources.source import StereoSource
 from recon.sources.video import split_views
 
@@ -41,28 +41,28 @@ _WAITING: Final = 32  # pairs to be written; more would only hide that the disk 
 _GAP_PERIODS: Final = 1.5  # a longer time step means that a frame was lost
 
 
+_Length = Annotated[int, Field(ge=16, le=100000)]
+
+
 class CaptureSettings(Settings):
     """Settings of a recording."""
 
-    width_px: int | None = Field(None, ge=16, le=100000)
-    """Requested frame width. none = the driver's default."""
-    height_px: int | None = Field(None, ge=16, le=100000)
-    """Requested frame height; with width_px."""
+    size_px: tuple[_Length, _Length] | None = None
+    """Requested width and height of frames. none = the driver's default."""
     rate_hz: float | None = Field(None, ge=0.001, le=1000000.0)
     """Requested frame rate. none = the driver's default."""
     lock_exposure: bool = True
     """Lock exposure and white balance if the driver supports it. Turn it off where the light
     changes during the drive."""
-    side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = Field(
-        "left-right"
-    )
-    """Arrangement of the views in the frames of one device."""
     suffix: Literal["png", "jpg"] = "png"
     """File format: png = lossless, jpg = for a slow disk."""
 
 
 class RecordingSettings(CaptureSettings):
-    """The settings of one recording, and when it ends."""
+    """The settings of one recording, how the views of one device lie, and when it ends."""
+
+    side_by_side: SideBySide = "left-right"
+    """Arrangement of the views in the frames of one device."""
 
     frames: int | None = Field(None, ge=1, le=1_000_000_000)
     """Stop after this many pairs."""
@@ -85,12 +85,10 @@ class CapturedPair:
 @contextmanager
 def open_cameras(devices: Iterable[str], settings: CaptureSettings) -> Iterator[tuple[Camera, ...]]:
     """Open a left and a right camera, or one with both views, by number, path or address."""
-    width, height = settings.width_px, settings.height_px
-    size = None if width is None or height is None else (width, height)
     with ExitStack() as stack:
         cameras: list[Camera] = []
         for device in devices:
-            cameras.append(Camera(device, size, settings.rate_hz))
+            cameras.append(Camera(device, settings.size_px, settings.rate_hz))
             stack.callback(cameras[-1].close)
         yield tuple(cameras)
 
@@ -146,7 +144,7 @@ def _grab(cameras: tuple[Camera, ...], period_s: float) -> list[float] | None:
     return None
 
 
-def _retrieve(cameras: tuple[Camera, ...], settings: CaptureSettings) -> tuple[UInt8, UInt8]:
+def _retrieve(cameras: tuple[Camera, ...], settings: RecordingSettings) -> tuple[UInt8, UInt8]:
     images = [camera.retrieve() for camera in cameras]
     if len(images) == 1:
         stacked = settings.side_by_side in {"top-bottom", "bottom-top"}
@@ -378,7 +376,9 @@ def open_camera_source(
             expected=0,
             hint="record them with recon capture, and map the recording with it",
         )
-    recording = RecordingSettings.parse({**dict(settings), "frames": source.end})
+    recording = RecordingSettings.parse(
+        {**dict(settings), "side_by_side": source.side_by_side, "frames": source.end}
+    )
     with open_cameras(devices, settings) as cameras:
         where = " and ".join(camera.name for camera in cameras)
         if not source.has_camera:

@@ -13,6 +13,7 @@ from recon.core.settings import Settings
 from recon.io.files import StrPath
 from recon.io.images.image import MAX_MEGAPIXELS
 
+SideBySide = Literal["left-right", "right-left", "top-bottom", "bottom-top"]
 _Frame = Annotated[int, Field(ge=0, le=1_000_000_000)]
 
 
@@ -68,8 +69,8 @@ class SourceSettings(Settings):
     """Two frames of those used, counted from 0, and how far apart the left camera was in them,
     metres, such as [0, 143, 118.3]: it shows the baseline, and with it the scale. none = the
     baseline as calibrated."""
-    side_by_side: Literal["left-right", "right-left", "top-bottom", "bottom-top"] = "left-right"
-    """Arrangement of the two views in the frames of one video."""
+    side_by_side: SideBySide = "left-right"
+    """Arrangement of the two views in the frames of one video, or of one camera."""
 
     def named_in(self, folder: Path) -> tuple[Path, Path] | None:
         """Return the left and right file that are named of a folder; None = neither is."""

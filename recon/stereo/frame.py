@@ -6,16 +6,18 @@ Points have their uncertainties; flying edges and outliers are left out.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
 import cv2
 import numpy as np
-from pydantic import Field
+from pydantic import Field, SerializeAsAny, model_validator
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
+from recon.core.renamed import current_names
 from recon.core.settings import Length, Settings
 from recon.core.values import (
     Disparity,
@@ -178,8 +180,6 @@ class CloudSettings(Settings):
     inferred: bool = False
     """Points also of pixels whose disparity is not measured, but that of planes around them; they
     are marked. Turn it on where a surface without holes counts more than a true one."""
-    stride: int = Field(1, ge=1, le=16)
-    """Every n-th row and column is used. Raise it for speed with large images."""
 
 
 def back_project(
@@ -232,7 +232,7 @@ def _rules(camera: RectifiedCamera, settings: CloudSettings, normals: bool) -> p
         nearest=settings.min_range_m,
         farthest=_or_infinity(settings.max_range_m),
         relative_sigma=_or_infinity(settings.max_relative_sigma),
-        stride=settings.stride,
+        stride=1,
         radius=_NORMALS_RADIUS_PX if normals else 0,
     )
 
@@ -273,16 +273,13 @@ _RADIUS_NEIGHBOURS: Final = 2  # that a point needs within the radius: fewer are
 
 
 class FilterSettings(Settings):
-    """Which filters are applied to a cloud, in this order; none turns one off."""
+    """Which filters are applied to the cloud of one frame, in this order; none turns one off."""
 
     voxel_m: float | None = Field(None, ge=1e-06, le=1000000.0)
     """Edge of the voxels that points are averaged in. Set it for fewer points."""
     statistical_neighbours: int | None = Field(None, ge=1, le=100)
     """Neighbours of the statistical outlier filter, which drops points that are farther from them
-    than most. Several times as slow as the others; for one pair, or a map with noise in the air."""
-    radius_m: float | None = Field(None, ge=1e-06, le=1000000.0)
-    """Points with fewer than two others within this radius are dropped. About three voxels; larger
-    drops larger islands."""
+    than most. For one pair: fusion cleans the clouds of a drive, and the filter is slow."""
 
 
 # For the cloud of one pair, whose scale is unknown: no filter with a length in metres.
@@ -302,10 +299,14 @@ def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
             cloud.xyz, settings.statistical_neighbours, _STATISTICAL_SIGMAS
         )
         cloud = cloud.select(keep)
-    if settings.radius_m is not None:
-        keep = open3d_clouds.radius_inliers(cloud.xyz, _RADIUS_NEIGHBOURS, settings.radius_m)
-        cloud = cloud.select(keep)
     return cloud
+
+
+def drop_islands(cloud: PointCloud, radius_m: float | None) -> PointCloud:
+    """Drop points with too few others within a radius; None = keep all."""
+    if radius_m is None:
+        return cloud
+    return cloud.select(open3d_clouds.radius_inliers(cloud.xyz, _RADIUS_NEIGHBOURS, radius_m))
 
 
 def voxel_downsample(cloud: PointCloud, voxel_m: float) -> PointCloud:
@@ -324,11 +325,14 @@ class StereoSettings(Settings):
     """Everything that determines the cloud of one frame."""
 
     rectification: RectificationSettings = RectificationSettings()
-    matching: MatchingSettings = MatchingSettings()
+    matching: SerializeAsAny[MatchingSettings] = MatchingSettings()  # with those of plug-ins
     cloud: CloudSettings = CloudSettings()
     filters: FilterSettings = FilterSettings()
-    """Filters of the cloud of one frame, in this order; none turns one off. Fusion thins and cleans
-    the clouds of a drive anyway."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_old_names(cls, values: Any) -> Any:
+        return current_names(values)[0] if isinstance(values, Mapping) else values
 
     def with_matcher(self, matcher: str | Matcher | None) -> Self:
         """Return the settings with another matcher, by name or as an object; None = unchanged.

@@ -18,7 +18,7 @@ import numpy as np
 from recon.core.errors import MatchingError
 from recon.core.text import counted
 from recon.core.values import Disparity, Rectified, RectifiedImage, RectifiedPair
-from recon.stereo.match.registry import MatchingSettings, make_matcher, searched
+from recon.stereo.match.registry import MatchingSettings, make_matcher
 from recon.stereo.match.sad import HalfSizeMatcher, estimate_ndisp
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.rectify.epipolar import count_aligned
@@ -160,7 +160,7 @@ class Matching:
         self, rectifier: Rectifier, settings: MatchingSettings, threads: int | None
     ) -> None:
         self.rectify = rectifier.rectify
-        self._searched, self._threads = searched(settings), threads
+        self._searched, self._threads = settings, threads
         names = {"match": settings.matcher, "match_keyframes": settings.keyframe_matcher}
         self.matchers = {
             effort: make_matcher(name, settings, threads)

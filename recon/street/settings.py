@@ -39,12 +39,8 @@ class StreetSettings(Settings):
     """Image height."""
     focal_px: float = Field(360.0, ge=1.0, le=100000.0)
     """Focal length."""
-    baseline_m: float = Field(0.54, ge=0.001, le=5.0)
-    """Distance between the cameras."""
     camera_height_m: float = Field(1.65, ge=0.3, le=4.0)
     """Height of the cameras above the road."""
-    pitch_deg: float = Field(1.0, ge=-30.0, le=30.0)
-    """Pitch of the mounted rig; positive = down."""
 
     @model_validator(mode="before")
     @classmethod
@@ -70,6 +66,8 @@ class StreetScene(StreetSettings):
     #: Fences, railings, hedges, wires and shop windows instead of parked cars and furniture.
     fences: bool = False
     sway: float = Field(default=1.0, ge=0.0, le=5.0)  # of drift and pitching of the car; 0 = none
+    baseline_m: float = Field(default=0.54, ge=0.001, le=5.0)
+    pitch_deg: float = Field(default=1.0, ge=-30.0, le=30.0)  # of the mounted rig; positive = down
     yaw_deg: float = Field(default=1.5, ge=-45.0, le=45.0)  # of the mounted rig; positive = right
     roll_deg: float = Field(default=0.3, ge=-30.0, le=30.0)  # positive = clockwise
     #: Sensor noise, standard deviation in grey levels (0 to 255).

@@ -104,9 +104,10 @@ def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> Triangl
 
 def rig(settings: StreetSettings) -> RectifiedCamera:
     """Return the rectified cameras of the settings, with principal points at the centre."""
+    baseline_m = StreetScene.of(settings).baseline_m
     width, height = settings.width_px, settings.height_px
     cx, cy, focal = (width - 1) / 2, (height - 1) / 2, settings.focal_px
-    return RectifiedCamera(focal, cx, cy, cx, settings.baseline_m, width, height)
+    return RectifiedCamera(focal, cx, cy, cx, baseline_m, width, height)
 
 
 def _sun(seed: int) -> Float64:

@@ -145,7 +145,7 @@ def _submap(map_: Map, number: int) -> Scene:
     cloud = transform_cloud(sums, T, frame="map")
     voxels = submap.occupancy.voxels(settings.occupancy.resolution_m)
     path_m = apply(T, drive.odometry.positions_m[submap.first_frame :][: submap.frames])
-    ground = estimate_ground_surface(cloud, path_m, settings.ground)
+    ground = estimate_ground_surface(cloud, path_m, settings.ground, settings.occupancy.max_range_m)
     height_m = float(path_m[:, 2].mean() - np.nan_to_num(ground.camera_height_m))
     points = _dated([Points(f"{number}", cloud)], _paths(map_))
     return Scene(points, grids=((flatten(voxels, ground, settings.grid), height_m),))

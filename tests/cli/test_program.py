@@ -37,11 +37,11 @@ def line(folder: Path = ROOT, /, **changes: Any) -> list[str]:
 
 
 def test_a_command_line_has_what_the_job_says_and_limits_are_needs_of_a_worker():
-    changes = {"options": ["--no-mesh"], "set": ["matching.sad.window_px=9"]}
+    changes = {"options": ["--no-mesh"], "set": ["matching.window_px=9"]}
     limits = {"threads": 2, "memory": "4G", "timeout_s": 5.0, "retries": 0}
     (job,) = plan({**DRIVE, **changes, **limits})
     assert job.command_line(Path("out")) == [
-        "map", "drive", "--set", "matching.sad.window_px=9", "--threads", "2", "--memory-limit",
+        "map", "drive", "--set", "matching.window_px=9", "--threads", "2", "--memory-limit",
         "4G", "--no-mesh", "--json", "--verbose", "--out", "out",
     ]  # fmt: skip
     assert (job.timeout_s, job.retries, job.needs) == (5.0, 0, {"threads": 2.0, "memory": 4e9})
@@ -107,10 +107,10 @@ def test_a_sweep_spreads_every_job_over_every_combination_of_right_values():
     assert (len(jobs), jobs[0].name) == (8, "a_window_px=9_matcher=sad")
     found = jobs[0].words
     assert found[-4:] == (
-        "--set", "matching.sad.window_px=9", "--set", 'matching.matcher="sad"',
+        "--set", "matching.window_px=9", "--set", 'matching.matcher="sad"',
     )  # fmt: skip
     assert jobs[7].name == "b_window_px=11_matcher=sgm"
-    assert jobs[7].swept == {"matching.sad.window_px": 11, "matching.matcher": "sgm"}
+    assert jobs[7].swept == {"matching.window_px": 11, "matching.matcher": "sgm"}
     with pytest.raises(SettingsError, match=r"job a: .*matching\.sad\.window_px"):
         plan(DRIVE, matching__sad__window_px=[9, 11, "much"])
 
@@ -123,12 +123,12 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"source": []}, "job a: job has no source"),
     ({"source": ["x", "--repair=/abs"]}, "source is an option"),
     ({"name": "../a"}, "not a name of a folder"),
-    ({"set": ["matching.window_px=9"]}, "job a: .*matching.sad.window_px"),
+    ({"set": ["matching.window_px=9"]}, "job a: .*matching.window_px"),
     ({"options": ["--no-such"]}, "job a: No such option.*no-such"),
     ({"options": ["another"]}, "unexpected extra argument"),
     ({"command": "evaluate trajectory"}, "Missing argument"),
     ({"memory": "much"}, "cannot read this size"),
-    ({**TWO, "set": ["matching.sad.window_px=9"]}, "job a: command has no settings"),
+    ({**TWO, "set": ["matching.window_px=9"]}, "job a: command has no settings"),
     *(
         ({"options": options.split()}, "job a: a job cannot have this option")
         for options in (

@@ -360,11 +360,11 @@ def test_a_camera_that_does_not_open_is_named_and_the_other_one_closed(monkeypat
         return opened[-1]
 
     monkeypatch.setattr(capture, "Camera", make)
-    settings = capture.CaptureSettings(width_px=640, height_px=480, rate_hz=15)
+    settings = capture.CaptureSettings(size_px=(640, 480), rate_hz=15)
     with pytest.raises(SourceError, match="bad"), capture.open_cameras(["good", "bad"], settings):
         pass
     assert (asked, [camera.closed for camera in opened]) == ([((640, 480), 15.0)], [True])
-    with capture.open_cameras(["good"], capture.CaptureSettings(width_px=640)) as cameras:
+    with capture.open_cameras(["good"], capture.CaptureSettings()) as cameras:
         assert not cameras[0].closed
     assert asked[-1] == (None, None)
 

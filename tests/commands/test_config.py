@@ -19,12 +19,12 @@ from recon.run.directory import STARTED, state_folder
 @pytest.mark.parametrize(
     ("command", "defaults", "overrides"),
     [
-        ("map", {}, ["matching.sad.window_px=9", "cloud.max_range_m=none", "memory.limit_mb=900"]),
+        ("map", {}, ["matching.window_px=9", "cloud.max_range_m=none", "memory.limit_mb=900"]),
         ("map", {}, ["matching.matcher=sgm", "street.seed=3", "mesh.max_distance_spacings=none"]),
         ("pair", PAIR_DEFAULTS, ["filters.statistical_neighbours=none", "filters.voxel_m=0.1"]),
         ("pair", PAIR_DEFAULTS, ["matching.matcher=onnx", "matching.onnx.model=a.onnx"]),
         ("calibrate", {}, ["calibration.model=fisheye", "calibration.working_m=3"]),
-        ("paper", PAIR_DEFAULTS, ["paper.as_printed=true"]),
+        ("paper", PAIR_DEFAULTS, ["matching.matcher=sad", "matching.window_px=9"]),
     ],
 )
 def test_a_dumped_configuration_loads_back_equal(tmp_path, command, defaults, overrides):
@@ -33,14 +33,14 @@ def test_a_dumped_configuration_loads_back_equal(tmp_path, command, defaults, ov
     assert load_config(tmp_path / "config.yaml", defaults=defaults) == config
 
 
-SETTINGS = ["matching.matcher=sgm", "matching.sgm.p1=20", "fusion.voxel_m=0.2"]
+SETTINGS = ["matching.matcher=opencv-bm", "matching.opencv.pad=true", "fusion.voxel_m=0.2"]
 
 
 @pytest.mark.parametrize("given", [
-    {"matching.matcher": "sgm", "matching.sgm.p1": 20, "fusion.voxel_m": 0.2},
-    {"matching": {"matcher": "sgm", "sgm": {"p1": 20}}, "fusion": {"voxel_m": 0.2}},
-    {"matching": {"matcher": "sgm", "sgm.p1": 20}, "fusion.voxel_m": 0.2},
-    {"matching": {"matcher": "sgm"}, "matching.sgm": {"p1": 20}, "fusion": {"voxel_m": 0.2}},
+    {"matching.matcher": "opencv-bm", "matching.opencv.pad": True, "fusion.voxel_m": 0.2},
+    {"matching": {"matcher": "opencv-bm", "opencv": {"pad": True}}, "fusion": {"voxel_m": 0.2}},
+    {"matching": {"matcher": "opencv-bm", "opencv.pad": True}, "fusion.voxel_m": 0.2},
+    {"matching": {"matcher": "opencv-bm"}, "matching.opencv": {"pad": True}, "fusion.voxel_m": 0.2},
 ])  # fmt: skip
 def test_settings_are_dicts_with_dotted_or_nested_keys(tmp_path, given):
     expected = load_config(None, SETTINGS)
@@ -55,8 +55,8 @@ def test_settings_are_dicts_with_dotted_or_nested_keys(tmp_path, given):
 
 
 @pytest.mark.parametrize(("given", "why"), [
-    ((None, {"matching.sad.window": 9}), "unknown setting 'matching.sad.window'.*window_px"),
-    (({"matching": {"sad": {"window": 9}}},), "unknown setting 'matching.sad.window'"),
+    ((None, {"matching.window": 9}), "unknown setting 'matching.window'.*window_px"),
+    (({"matching": {"window": 9}},), "unknown setting 'matching.window'"),
     ((None, "window"), r"cannot read this setting \(got 'window', expected key=value\)"),
     ((None, {".".join("a" * 20): 1}), "cannot read this setting"),
     ((9,), r"not settings \(got int, expected a file, a mapping or a ReconConfig\)"),
@@ -68,17 +68,17 @@ def test_what_are_no_settings_is_one_line(given, why):
 
 def test_assigning_to_a_setting_says_what_to_use_and_that_works():
     config = load_config(None, PAIR_DEFAULTS)
-    for group, name in ((config, "scene"), (config.matching.sad, "window_px"), (config.mesh, "x")):
+    for group, name in ((config, "scene"), (config.matching, "window_px"), (config.mesh, "x")):
         with pytest.raises(
             SettingsError, match=rf"{name}: settings do not .*load_config\(config, "
         ):
             setattr(group, name, 9)
-    changed = load_config(config, {"matching.sad.window_px": 9})
-    assert (changed.matching.sad.window_px, changed.cloud) == (9, config.cloud)
-    assert config.matching.sad.window_px != 9
+    changed = load_config(config, {"matching.window_px": 9})
+    assert (changed.matching.window_px, changed.cloud) == (9, config.cloud)
+    assert config.matching.window_px != 9
     # What follows from the size of the scene is not fixed by a change of something else.
     assert changed.at_scale(0.2) == load_config(
-        None, ["matching.sad.window_px=9"], PAIR_DEFAULTS
+        None, ["matching.window_px=9"], PAIR_DEFAULTS
     ).at_scale(0.2)
 
 
@@ -89,10 +89,12 @@ def test_a_command_writes_only_what_determines_its_result(tmp_path):
     groups = yaml.safe_load(drive)
     assert {"source", "odometry", "grid", "mesh"} <= {*groups}
     assert not {"calibration", "capture", "audit", "paper", "street", "checkpoints"} & {*groups}
-    assert {*groups["matching"]} == {"matcher", "sad"}
+    assert {*groups["matching"]} == {"matcher", "min_disparity_px", "fill"}
     assert {*load_config().recorded("mesh")} == {"mesh"}
     again = load_config(overrides=["matching.keyframe_matcher=fine"]).recorded("map")
-    assert {*again["matching"]} == {"matcher", "keyframe_matcher", "sad", "fine"}
+    assert {*again["matching"]} == {
+        "matcher", "keyframe_matcher", "min_disparity_px", "fill"
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("command", GROUPS)
@@ -101,17 +103,17 @@ def test_the_groups_of_every_command_are_settings(command):
 
 
 def test_an_override_wins_for_its_key_and_the_file_is_not_blamed_for_a_wrong_one(tmp_path):
-    (tmp_path / "c.yaml").write_text("mesh: {max_depth: 8}\nmatching: {sad: {window_px: 7}}\n")
-    changes = ["matching.sad.window_px=9", "fusion.min_count=2", "fusion.min_count=5"]
+    (tmp_path / "c.yaml").write_text("mesh: {depth: 8}\nmatching: {window_px: 7}\n")
+    changes = ["matching.window_px=9", "fusion.min_count=2", "fusion.min_count=5"]
     config = load_config(f"{tmp_path}/c.yaml", [*changes, "fusion.voxel_m=0.2"], PAIR_DEFAULTS)
-    assert config.matching.sad.window_px == 9
-    assert (config.fusion.min_count, config.fusion.voxel_m, config.mesh.max_depth) == (5, 0.2, 8)
+    assert config.matching.window_px == 9
+    assert (config.fusion.min_count, config.fusion.voxel_m, config.mesh.depth) == (5, 0.2, 8)
     assert config.cloud.max_range_m is None
     (tmp_path / "c.yaml").write_text("")
     assert load_config(tmp_path / "c.yaml") == ReconConfig()
     (tmp_path / "good.yaml").write_text("matching:\n  matcher: sgm\n")
-    with pytest.raises(SettingsError, match=r"^setting 'matching\.sad\.window_px': ") as refused:
-        load_config(tmp_path / "good.yaml", ["matching.sad.window_px=8"])
+    with pytest.raises(SettingsError, match=r"^setting 'matching\.window_px': ") as refused:
+        load_config(tmp_path / "good.yaml", ["matching.window_px=8"])
     assert "good.yaml" not in str(refused.value)
 
 

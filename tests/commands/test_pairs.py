@@ -29,9 +29,9 @@ def noise():
 
 
 def test_settings_are_those_of_the_matcher_that_is_named(noise):
-    assert recon.match(*noise, matcher="opencv-bm", block_px=15).values.shape == (50, 120)
-    with pytest.raises(SettingsError, match="block_px"):
-        recon.match(*noise, block_px=15)
+    assert recon.match(*noise, matcher="opencv-bm", window_px=15).values.shape == (50, 120)
+    with pytest.raises(SettingsError, match="unknown setting 'matching"):
+        recon.match(*noise, matcher="fine", window_px=15)
     with pytest.raises(SettingsError, match="unknown matcher"):
         recon.match(*noise, matcher="nonsense")
 
@@ -39,19 +39,17 @@ def test_settings_are_those_of_the_matcher_that_is_named(noise):
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        (["matching.sad.fill=false"], ["sad"]),
-        (["matching.sad.window_px=9", "matching.sgm.p2=60"], ["sad", "sgm"]),
-        (["matching.fine.fill=false"], []),
-        ([f"matching.{name}.ndisp=32" for name in ("sad", "sgm", "fine", "opencv")], []),
-        (["matching.matcher=sad", "matching.sad.window_px=9"], []),
+        (["matching.window_px=9", "matching.opencv.pad=true"], ["window_px", "opencv"]),
+        (["matching.fill=false", "matching.ndisp=32"], []),
+        (["matching.matcher=sad", "matching.window_px=9"], []),
     ],
 )
 def test_settings_of_a_matcher_that_is_not_used_are_said_to_have_no_effect(noise, changes, named):
     config = load_config(None, changes, PAIR_DEFAULTS)
     given = PairInput(StereoPair(*noise), recon.RectifiedCamera(100.0, 60, 25, 60, 0.1, 120, 50))
     found = recon.run_disparity(given, config)
-    said = [text for text in found.warnings if "have no effect" in text]
-    assert [text.split()[3] for text in said] == [f"matching.{name}" for name in named]
+    said = [text for text in found.warnings if "has no effect" in text]
+    assert [text.split()[0] for text in said] == [f"matching.{name}" for name in named]
 
 
 CALIBRATIONS = {
@@ -104,7 +102,7 @@ def test_focal_length_and_baseline_give_metres_and_a_principal_point_is_that_of_
 
 def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(images, tmp_path):
     given = read(images, SourceSettings(focal_px=300))
-    settings = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+    settings = load_config(None, ["mesh.depth=5"], PAIR_DEFAULTS)
     run = run_pair(given, settings, out=tmp_path / "out")
     assert run.summary.to_json()["up_to_scale"] is True
     assert run.summary.to_json()["depth_median_m"] == pytest.approx(
@@ -114,7 +112,7 @@ def test_without_a_baseline_the_cloud_is_up_to_scale_and_says_so(images, tmp_pat
 
 
 def test_pixels_without_a_match_are_in_every_file_what_the_pages_say(images, tmp_path):
-    settings = load_config(None, ["matching.sad.fill=false"], PAIR_DEFAULTS)
+    settings = load_config(None, ["matching.fill=false"], PAIR_DEFAULTS)
     out = tmp_path / "out"
     run_pair(read(images, SourceSettings(focal_px=300, baseline_m=0.2)), settings, out=out)
 

@@ -263,10 +263,8 @@ def test_a_value_is_shown_in_one_line(value):
 
 def test_settings_show_what_differs_from_the_defaults():
     assert repr(recon.load_config()) == "ReconConfig()"
-    config = recon.load_config(overrides=["matching.matcher=sgm", "matching.sad.window_px=7"])
-    assert repr(config) == (
-        "ReconConfig(matching=MatchingSettings(matcher='sgm', sad=SadSettings(window_px=7)))"
-    )
+    config = recon.load_config(overrides=["matching.matcher=sgm", "matching.window_px=7"])
+    assert repr(config) == ("ReconConfig(matching=MatchingSettings(window_px=7, matcher='sgm'))")
 
 
 @pytest.mark.parametrize(

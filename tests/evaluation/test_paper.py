@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from recon.core.errors import CalibrationError, MatchingError, SettingsError
+from recon.core.errors import CalibrationError, MatchingError
 from recon.core.values import DisparityTruth, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
 from recon.core.values.camera import depth_from_disparity
@@ -36,12 +36,6 @@ def test_true_depths_have_no_error_and_those_of_table_1_a_large_one():
     assert paper.compare_depth(np.full((10, 20), np.nan, np.float32), truth, CAMERA) is None
     with pytest.raises(CalibrationError, match="doffs"):
         paper.camera_of_table_1(camera_for(347, 277))
-
-
-@pytest.mark.parametrize("values", [{"patch_px": 4}, {"patches_px": [3, 6]}, {"patches_px": []}])
-def test_even_patches_and_none_are_refused(values):
-    with pytest.raises(SettingsError, match="patch"):
-        paper.PaperSettings.parse(values)
 
 
 @pytest.mark.real

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from recon.commands.config import load_config
 from recon.core.errors import MeshingError, OutputError
 from recon.core.values import OccupancyVoxels, PointCloud, TriangleMesh
-from recon.export.mesh import cut
+from recon.export.mesh import cut, pieces, poisson
 from recon.export.mesh.pieces import export_mesh
 from recon.export.mesh.poisson import MeshSettings, reconstruct_map_surface
 from recon.io.models.mesh import read_mesh
@@ -161,9 +161,14 @@ def test_faces_and_normals_of_a_square_are_kept_dropped_and_weighed():
     np.testing.assert_allclose(cut.vertex_normals(vertices, faces)[0], expected, atol=1e-6)
 
 
+@pytest.fixture(autouse=True)
+def untrimmed(monkeypatch):
+    monkeypatch.setattr(poisson, "_LEAST_SUPPORTED", 0.0)
+
+
 STEP_M = 0.1
 CONFIG = load_config(None, ["submaps.tile_m=6.4"])
-SETTINGS = MeshSettings(tile_m=8.0, trim_density_quantile=0.0)
+SETTINGS = MeshSettings(tile_m=8.0)
 
 
 def street() -> PointCloud:
@@ -203,9 +208,9 @@ def written(store, folder, settings=SETTINGS, threads=None):
     return read_mesh(folder / "mesh" / "mesh.ply"), tiles, list(found.warnings)
 
 
-@pytest.mark.parametrize("way", ["voxels", "poisson"])
+@pytest.mark.parametrize("way", ["grid", "poisson"])
 def test_tiles_lie_on_the_surface_without_gaps_and_are_the_whole(store, tmp_path, way):
-    settings = SETTINGS.model_copy(update={"map_surface": way})
+    settings = SETTINGS.model_copy(update={"surface": way})
     whole, tiles, warnings = written(store, tmp_path / "alone", settings, threads=1)
     assert (warnings, len(tiles)) == ([], 2)
     triangles = np.concatenate([tile.vertices[tile.faces] for tile in tiles])
@@ -256,7 +261,7 @@ def test_a_target_is_that_of_all_tiles(store, tmp_path):
     assert 3000 < len(whole.faces) < 5000
 
 
-def test_what_hangs_where_cameras_looked_is_cut_off(store, tmp_path):
+def test_what_hangs_where_cameras_looked_is_cut_off(store, tmp_path, monkeypatch):
     ball = np.random.default_rng(5).normal(0, 1, (3000, 3)).astype(np.float32)
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     xyz, rgb = 0.5 * ball + np.float32([1.0, 0.0, 1.6]), np.full((3000, 3), 255, np.uint8)
@@ -264,8 +269,10 @@ def test_what_hangs_where_cameras_looked_is_cut_off(store, tmp_path):
     cells = np.stack(np.meshgrid(*[np.arange(-8, 20)] * 2, np.arange(3, 13), indexing="ij"), -1)
     free = cells.reshape(-1, 3).astype(np.int32)
     put_voxels(store, OccupancyVoxels(free, np.full(len(free), -1, np.float32), 0.2))
-    kept = SETTINGS.model_copy(update={"free_space": False})
-    assert (written(store, tmp_path / "kept", kept)[0].vertices[:, 2] > 1.0).sum() > 500
+    with monkeypatch.context() as patched:
+        patched.setattr(pieces, "looked_through", lambda xyz, voxels: np.zeros(len(xyz), np.bool_))
+        kept = written(store, tmp_path / "kept")[0]
+    assert (kept.vertices[:, 2] > 1.0).sum() > 500
     whole = written(store, tmp_path / "cut")[0]
     above = whole.vertices[(whole.vertices[:, 2] > 1.0) & (whole.vertices[:, 1] < 2.5)]
     assert len(above) == 0
@@ -318,7 +325,7 @@ def test_tiles_with_too_few_points_are_reported_and_none_is_an_error(store, tmp_
     stray = np.array([[60, 60, 0], [61, 60, 0], [90, 90, 0]], dtype=np.float32)
     cloud = street().select(np.arange(3))
     put_cloud(store, PointCloud(stray, rgb=cloud.rgb, normals=cloud.normals, frame="map"))
-    coarse = SETTINGS.model_copy(update={"max_depth": 5})
+    coarse = SETTINGS.model_copy(update={"depth": 5})
     warnings = written(store, tmp_path / "few", coarse)[2]
     assert len(warnings) == 1
     assert warnings[0].startswith("no surface in 2 of 4 tiles, 0.0% of the points (too few points")

@@ -69,7 +69,7 @@ def test_the_grid_of_tiles_is_that_of_the_whole(mapped, folder):
     cloud = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     path_m = apply(mapped.T_map_world, mapped.trajectory.positions_m)
     floor = add_floors(cloud, find_floors(mapped.voxels))
-    ground = estimate_ground_surface(floor, path_m, config.ground)
+    ground = estimate_ground_surface(floor, path_m, config.ground, config.occupancy.max_range_m)
     whole = flatten(mapped.voxels, ground, config.grid)
     narrow = load_config(None, [*SETTINGS, "grid.vehicle_width_m=0"])
     written = write_products(replace(mapped, config=narrow), folder).grid
@@ -219,8 +219,8 @@ def test_a_costmap_of_tiles_lies_on_the_grid_and_has_the_robot_in_it(mapped, fol
 
 
 def test_a_costmap_without_rays_or_for_a_robot_flatter_than_ground_is_refused(mapped):
-    low = load_config(None, [*SETTINGS, "robot.clearance_m=0.2"])
-    with pytest.raises(MappingError, match=r"clearance_m=0.2.*grid.min_height_m=0.3"):
+    low = load_config(None, [*SETTINGS, "grid.max_height_m=0.2"])
+    with pytest.raises(MappingError, match=r"band of the grid is empty.*0.3 to 0.2 m"):
         make_costmap(mapped.map, place_map(mapped.map, low))
     config = load_config(None, [*SETTINGS, "occupancy.keep_rays=false"])
     short = SyntheticSource(STREET.model_copy(update={"frames": 3}))

@@ -127,7 +127,7 @@ def test_a_surface_stays_open_unless_a_thickness_is_given():
     assert not trimesh.Trimesh(mesh.vertices, mesh.faces).is_watertight
 
 
-@pytest.mark.parametrize("other", [{"pair_surface": "poisson"}, {"target_faces": 1000}])
+@pytest.mark.parametrize("other", [{"surface": "poisson"}, {"target_faces": 1000}])
 def test_what_cannot_be_closed_is_said_before_anything_is_made(other):
     with pytest.raises(SettingsError, match="pair_solid_m"):
         MeshSettings.parse({"pair_solid_m": 0.1, **other})

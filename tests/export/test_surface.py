@@ -12,6 +12,7 @@ from recon.core.errors import MeshingError
 from recon.core.open3d_raycasting import RayScene
 from recon.core.values import PointCloud, RectifiedCamera, TriangleMesh
 from recon.core.values.camera import project
+from recon.export.mesh import poisson as poisson_file
 from recon.export.mesh.grid import mesh_grid
 from recon.export.mesh.poisson import MeshSettings, _fitting_depth, reconstruct_mesh
 from recon.export.pair import mesh_coverage
@@ -42,7 +43,12 @@ def boundary_edges(mesh: TriangleMesh, most: int | None = None) -> int:
     return int((count == 1 if most is None else count > most).sum())
 
 
-WHOLE = MeshSettings(depth=5, trim_density_quantile=0)
+@pytest.fixture(autouse=True)
+def untrimmed(monkeypatch):
+    monkeypatch.setattr(poisson_file, "_LEAST_SUPPORTED", 0.0)
+
+
+WHOLE = MeshSettings(depth=5)
 
 
 def area_m2(mesh: TriangleMesh) -> float:
@@ -95,7 +101,7 @@ def test_the_same_cloud_gives_the_same_mesh_and_nothing_else_is_touched(capfd):
 @pytest.mark.parametrize("viewpoint_m", [None, (3.0, 0.0, 5.0)])
 def test_a_cloud_without_normals_gets_them(viewpoint_m):
     cloud = PointCloud(sphere(1000).xyz)
-    mesh = reconstruct_mesh(cloud, MeshSettings(depth=4, trim_density_quantile=0), viewpoint_m)
+    mesh = reconstruct_mesh(cloud, MeshSettings(depth=4), viewpoint_m)
     assert np.abs(radii(mesh) - 1).max() < 0.02
     along = np.einsum("ij,ij->i", mesh.normals, mesh.vertices - np.float32([3, 0, 5]))
     assert (np.abs(along) > 0.9).all()
@@ -122,12 +128,13 @@ def test_clouds_without_a_surface_are_refused(xyz, complaint):
         reconstruct_mesh(PointCloud(xyz.astype(np.float32)), MeshSettings())
 
 
-def test_the_depth_follows_the_spacing_of_the_points():
+def test_the_depth_follows_the_spacing_of_the_points(monkeypatch):
     coarse, fine = sphere(1000), sphere(16000)  # spacings differ by four: two levels
-    chosen = [_fitting_depth(cloud.xyz, MeshSettings()) for cloud in (coarse, fine)]
+    chosen = [_fitting_depth(cloud.xyz) for cloud in (coarse, fine)]
     assert chosen[1] - chosen[0] == 2
-    assert _fitting_depth(fine.xyz, MeshSettings(max_depth=4)) == 4
-    assert _fitting_depth((100 * fine.xyz).astype(np.float32), MeshSettings()) == chosen[1]
+    assert _fitting_depth((100 * fine.xyz).astype(np.float32)) == chosen[1]
+    monkeypatch.setattr(poisson_file, "_MAX_DEPTH", 4)
+    assert _fitting_depth(fine.xyz) == 4
 
 
 def test_points_of_one_plane_and_those_that_are_not_finite_give_their_surface():

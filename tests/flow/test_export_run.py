@@ -23,6 +23,7 @@ from recon.commands.pair import run_pair
 from recon.core.errors import EvaluationError, FormatError, ReconError, SettingsError
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import OCCUPIED, RectifiedCamera, StereoPair
+from recon.export.mesh import pieces
 from recon.io.models.mesh import read_mesh
 from recon.io.models.octomap import read_octomap
 from recon.io.models.ply import read_ply
@@ -265,7 +266,7 @@ def test_a_pair_gives_its_cloud_and_mesh_and_no_grid(tmp_path):
     world = np.asarray(cv2.normalize(smooth, None, 0, 255, cv2.NORM_MINMAX), np.uint8)
     pair = StereoPair(world[:, :160], world[:, 12:172], name="left.png")
     camera, run = RectifiedCamera(150.0, 80.0, 60.0, 80.0, 0.1, 160, 120), tmp_path / "run"
-    shallow = ["mesh.max_depth=5"]
+    shallow = ["mesh.depth=5"]
     run_pair(PairInput(pair, camera), load_config(None, shallow, PAIR_DEFAULTS), out=run)
     config = run_settings(run, None, shallow)
     summary = run_export(run, config, formats=("ply", "glb"), out=tmp_path / "out").to_json()
@@ -278,7 +279,7 @@ def test_a_pair_gives_its_cloud_and_mesh_and_no_grid(tmp_path):
 
 def mesh_of(run: Path, out: Path, *settings: str) -> dict[str, Any]:
     # What is written is asked, not how fine it is.
-    config = load_config(None, ["mesh.tile_m=10", "mesh.max_depth=5", *settings])
+    config = load_config(None, ["mesh.tile_m=10", "mesh.depth=5", *settings])
     return run_mesh(run, config, out=out, formats=("ply", "glb")).to_json()
 
 
@@ -299,16 +300,18 @@ def test_the_map_of_a_run_is_meshed_in_pieces(small_demo, tmp_path):
 
 
 def test_one_piece_is_the_mesh_itself_without_the_faces_in_free_space(
-    small_demo, without_rays, tmp_path
+    small_demo, without_rays, tmp_path, monkeypatch
 ):
     # Poisson's surface goes on into space; that of the voxels does so where something moved.
-    one, out = ("mesh.tile_m=1000", "mesh.map_surface=poisson"), tmp_path / "cut"
+    one, out = ("mesh.tile_m=1000", "mesh.surface=poisson"), tmp_path / "cut"
     cut = mesh_of(small_demo, out, *one)
     assert cut["tiles"] == 1
     assert layers(out) == ["mesh.ply", "cloud.ply"]
     files = sorted(p.name for p in (out / "mesh").iterdir() if p.is_file())
     assert files == ["cloud.ply", "mesh.glb", "mesh.mlp", "mesh.ply"]
-    kept = mesh_of(small_demo, tmp_path / "kept", *one, "mesh.free_space=false")
+    with monkeypatch.context() as patched:
+        patched.setattr(pieces, "looked_through", lambda xyz, voxels: np.zeros(len(xyz), np.bool_))
+        kept = mesh_of(small_demo, tmp_path / "kept", *one)
     assert kept["faces"] > cut["faces"] > 100
     [*_, warning] = mesh_of(without_rays, tmp_path / "unknown", *one)["warnings"]
     assert "free space is not known" in warning
@@ -439,7 +442,7 @@ def test_grids_that_others_drew_larger_are_compared_too(small_demo, copy):
 STREETS = {
     "curve": ["street.seed=1"],
     "another": ["street.seed=3"],
-    "straight, tilted camera": ["street.seed=5", "street.path=straight", "street.pitch_deg=4"],
+    "straight": ["street.seed=5", "street.path=straight"],
 }
 
 

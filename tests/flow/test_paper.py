@@ -10,6 +10,7 @@ import pytest
 
 from recon.commands.config import load_config
 from recon.commands.paper import run_paper
+from recon.evaluation import paper
 from recon.io.images.disparity import read_pfm
 from recon.io.models.ply import read_ply
 from recon.report import paper_page, style
@@ -44,8 +45,9 @@ def scenes(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(scenes, tmp_path_factory):
     out = tmp_path_factory.mktemp("paper") / "run"
-    options = ("--as-printed", "--set", "paper.patches_px=[3,7,11]", "--json")
-    done = refusals.run("paper", scenes, *options, "--out", out)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(paper, "PATCHES_PX", (3, 7, 11))
+        done = refusals.run("paper", scenes, "--as-printed", "--json", "--out", out)
     assert done.code == 0, done.err
     return out, json.loads(done.out)
 
@@ -94,21 +96,22 @@ def test_only_the_corrected_method_has_the_right_depth(run):
     assert np.allclose(depths[known], 10 * 0.2 / disparity[known], rtol=1e-6)
 
 
-def test_its_configuration_gives_the_same_figures(scenes, run, tmp_path):
+def test_its_configuration_gives_the_same_figures(scenes, run, tmp_path, monkeypatch):
     printed = run[1]["experiments"]
     assert summary_of(run[0])["experiments"] == printed
-    config = load_config(run[0] / "config.yaml", ["paper.as_printed=false"])
+    config = load_config(run[0] / "config.yaml")
+    monkeypatch.setattr(paper, "PATCHES_PX", (3, 7, 11))
     again = run_paper(scenes, config, out=tmp_path / "again", threads=1).to_json()
     for number, one in again["experiments"].items():
         for kind in ("methods", "patches"):
             assert one[kind] == {"corrected": printed[number][kind]["corrected"]}
 
 
-def test_a_scene_without_truth_is_reconstructed_and_told(scenes, tmp_path):
+def test_a_scene_without_truth_is_reconstructed_and_told(scenes, tmp_path, monkeypatch):
     copy = Path(shutil.copytree(scenes, tmp_path / "scenes"))
     (copy / "ArtL" / "disp0GT.pfm").unlink()
-    options = ("--set", "paper.patches_px=[5]", "--out", tmp_path / "out", "--json")
-    done = refusals.run("paper", copy, *options)
+    monkeypatch.setattr(paper, "PATCHES_PX", (5,))
+    done = refusals.run("paper", copy, "--out", tmp_path / "out", "--json")
     assert done.code == 0, done.err
     summary = json.loads(done.out)
     assert summary["experiments"]["2"]["methods"]["corrected"]["disparity"] is None

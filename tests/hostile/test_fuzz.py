@@ -110,7 +110,7 @@ TEXTS: Final[dict[str, tuple[str, str, Callable[[Path], Any]]]] = {
     "frames": ("frames.csv", "# a\nl/0.png,r/0.png,0.0,0.0\n", read_frames),
     "stamps": ("data.csv", "1403636579763555584,a.png\n", partial(read_stamped_names, unit_s=1e-9)),
     "dates": ("timestamps.txt", "2011-09-26 13:02:25.964389445\n" * 2, read_dates),
-    "settings": ("c.yaml", "matching: {sad: {window_px: 9}}\n", load_config),
+    "settings": ("c.yaml", "matching: {window_px: 9}\n", load_config),
     "yaml": ("y.yaml", "a: [1, 2]\nb: &b {c: 1.5}\nd: *b\n", read_yaml),
     "pgm, ascii": ("i.pgm", "P2 3 2 255\n1 2 3 4 5 6\n", read_image),
 }

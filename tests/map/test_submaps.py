@@ -22,7 +22,7 @@ from recon.map.map import Map
 from recon.map.occupancy.part import free_part, join_occupancy
 from recon.map.store.session import Submaps
 from recon.map.tiles import Tiles
-from recon.stereo.frame import filter_cloud
+from recon.stereo.frame import drop_islands
 from tests.map.walls import (
     CONFIG,
     T_MAP_WORLD,
@@ -158,7 +158,7 @@ def _tiles(store: Submaps, T_corrected_world: Float64 | None = None) -> Tiles:
 def test_tiles_together_are_the_filtered_whole(store):
     tiles = _tiles(store, np.tile(np.eye(4), (len(store), 1, 1)))
     fused = join_fused(submap.fused for submap in store).cloud(0.1, 5)
-    whole = transform_cloud(filter_cloud(fused, CUT.map_filters), T_MAP_WORLD, frame="map")
+    whole = transform_cloud(drop_islands(fused, CUT.map_filters.radius_m), T_MAP_WORLD, frame="map")
     assert sum(len(tile.cloud) > 0 for tile in tiles) >= 3
     assert 0 < len(whole) < len(fused)
     ours, theirs = cloud_of(tiles), whole.select(np.lexsort(whole.xyz.T))

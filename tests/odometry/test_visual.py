@@ -17,7 +17,8 @@ from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.registry import make_odometry
 from recon.odometry.settings import OdometrySettings, PriorSettings
 from recon.odometry.visual import VisualOdometry
-from recon.stereo.match.sad import HalfSizeMatcher, SadSettings
+from recon.stereo.match.sad import HalfSizeMatcher
+from recon.stereo.match.search import SearchSettings
 from tests.odometry.conftest import STEP, See, make_frame, off_m, steps
 
 Street = tuple[OdometryFrame, ...]
@@ -167,7 +168,7 @@ def test_what_all_disparities_are_off_is_in_the_length_as_health_says(error_px, 
 
 
 def test_rough_disparities_give_nearly_the_same_path(see_both, street_poses):
-    matcher = HalfSizeMatcher(SadSettings(), threads=1)
+    matcher = HalfSizeMatcher(SearchSettings(), threads=1)
     pairs = [see_both(T, index).pair for index, T in enumerate(street_poses)]
     found = register([OdometryFrame(pair, matcher.match(pair), rough=True) for pair in pairs])
     # 2 % of the length; the first pose is the identity.

@@ -28,7 +28,7 @@ from recon.stereo.observe import Support
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
 CAMERA = RectifiedCamera(300.0, 160.0, 120.0, 160.0, 0.1, 320, 240)
-SETTINGS = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+SETTINGS = load_config(None, ["mesh.depth=5"], PAIR_DEFAULTS)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Points are exact, with their errors; those between surfaces and outliers are removed."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from recon.stereo.frame import (
     CloudSettings,
     FilterSettings,
     back_project,
+    drop_islands,
     filter_cloud,
     remove_flying_edges,
     voxel_downsample,
@@ -73,7 +75,7 @@ def test_sigma_grows_with_the_square_of_depth_and_is_its_spread_under_noise():
     assert np.std(cloud.xyz[:, 2]) == pytest.approx(float(np.mean(cloud.sigma_m)), rel=0.05)
 
 
-def test_range_sigma_and_stride_decide_what_is_kept():
+def test_range_and_sigma_decide_what_is_kept():
     disparity = as_disparity(np.tile(np.linspace(0.5, 36, 64), (40, 1)))
 
     def kept(**settings: float | None) -> np.ndarray:
@@ -85,8 +87,6 @@ def test_range_sigma_and_stride_decide_what_is_kept():
     assert 2.8 < z.max() <= 3.0
     # sigma_z / Z = Z·sigma_d / (f·b) = 0.05 at Z = 2 m.
     assert 1.9 < kept(max_relative_sigma=0.05)[:, 2].max() <= 2.0
-    raster = np.arange(40 * 64).reshape(SHAPE)[::3, ::3].ravel()
-    np.testing.assert_array_equal(kept(stride=3), kept()[raster])
 
 
 def test_points_carry_colours_and_those_beyond_infinity_or_without_source_are_not_made():
@@ -153,14 +153,13 @@ def inferred_alone(both: Disparity) -> Disparity:
     return both.reject(both.measured, Reason.LEFT_RIGHT)
 
 
-@pytest.mark.parametrize("stride", [1, 3])
-def test_points_that_were_inferred_say_so(both, stride):
-    asked = ALL.model_copy(update={"inferred": True, "stride": stride})
+def test_points_that_were_inferred_say_so(both):
+    asked = ALL.model_copy(update={"inferred": True})
     cloud = back_project(both, make_pair(), asked)
     u, _, _ = project(cloud.xyz.astype(np.float64), CAMERA)
     np.testing.assert_array_equal(cloud.inferred, np.rint(u) >= 40)
     np.testing.assert_allclose(cloud.confidence, 0.7, rtol=1e-6)
-    measured = back_project(both, make_pair(), ALL.model_copy(update={"stride": stride}))
+    measured = back_project(both, make_pair(), ALL)
     np.testing.assert_array_equal(cloud.only_measured().xyz, measured.xyz)
     assert set(back_project(inferred_alone(both), make_pair(), asked).inferred) == {1}
     assert not back_project(both.only_measured(), make_pair(), asked).inferred.any()
@@ -235,10 +234,12 @@ def wall_with_outliers() -> tuple[PointCloud, np.ndarray]:
     return PointCloud(xyz), np.arange(len(xyz)) < len(wall)
 
 
-@pytest.mark.parametrize("settings", [FilterSettings(radius_m=0.15), ANY_SCALE])
-def test_planted_outliers_go_and_the_planted_surface_stays(settings):
+@pytest.mark.parametrize(
+    "filtered", [partial(drop_islands, radius_m=0.15), partial(filter_cloud, settings=ANY_SCALE)]
+)
+def test_planted_outliers_go_and_the_planted_surface_stays(filtered):
     cloud, on_wall = wall_with_outliers()
-    near_wall = filter_cloud(cloud, settings).xyz[:, 2] > 4.9
+    near_wall = filtered(cloud).xyz[:, 2] > 4.9
     assert near_wall.sum() >= 0.99 * on_wall.sum()
     assert (~near_wall).sum() <= 0.05 * (~on_wall).sum()
     assert filter_cloud(cloud, FilterSettings()) is cloud
@@ -273,8 +274,7 @@ def test_a_voxel_averages_every_attribute():
 @pytest.mark.parametrize("points", [0, 1, 2])
 def test_clouds_of_almost_nothing_pass(points):
     cloud = PointCloud(np.zeros((points, 3), dtype=np.float32))
-    settings = FilterSettings(statistical_neighbours=20, radius_m=0.3)
-    assert len(filter_cloud(cloud, settings)) <= points
+    assert len(drop_islands(filter_cloud(cloud, ANY_SCALE), 0.3)) <= points
 
 
 def frozen(xyz: np.ndarray) -> np.ndarray:

@@ -149,7 +149,7 @@ def real(data: Path) -> Iterator[tuple[str, StereoPair, object]]:
 @pytest.mark.real
 @pytest.mark.slow
 def test_no_good_pair_of_ours_is_warned_of_and_all_mixed_ones_are_refused(recon_data):
-    config = load_config(None, ["mesh.max_depth=5"], PAIR_DEFAULTS)
+    config = load_config(None, ["mesh.depth=5"], PAIR_DEFAULTS)
     pairs = list(real(recon_data))
     for name, pair, camera in pairs:
         warnings = recon.run_disparity(recon.PairInput(pair, camera), config).warnings

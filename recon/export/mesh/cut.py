@@ -232,7 +232,7 @@ def vertex_normals(vertices: Float32, faces: Int32) -> Float32:
 
 def _without_loose(vertices: Float32, faces: Int32) -> tuple[Float32, Int32]:
     if len(faces) == 0:
-        hint = "raise mesh.max_depth or mesh.max_distance_spacings, or filter less"
+        hint = "raise mesh.depth or mesh.max_distance_spacings, or filter less"
         raise MeshingError("trimming left no face of the surface", hint=hint)
     used, faces = renumbered(faces)
     return vertices[used], faces

@@ -118,7 +118,7 @@ def mesh_product(context: ExportContext, path: Path) -> ExportResult:
         if suffix != "ply":
             write_mesh(path.with_suffix(f".{suffix}"), read_mesh(path), "map")
     warnings = [*made.warnings]
-    if context.mesh.free_space and not has_occupancy(context.map):
+    if not has_occupancy(context.map):
         warnings.append("the map kept no rays: which faces lie in free space is not known")
     small = made.figures.faces <= SAMPLE_FACES
     mesh = read_mesh(path) if small or context.survey is not None else None
@@ -167,8 +167,7 @@ def _count(tiles: Tiles, settings: MeshSettings) -> Counter[PieceKey]:
         keys, counts = np.unique(pack_keys(np.pad(homes, ((0, 0), (0, 1)))), return_counts=True)
         places = ((x, y) for x, y, _ in unpack_keys(keys).tolist())
         found.update(dict(zip(places, counts.tolist(), strict=True)))
-        if settings.free_space:
-            len(tile.voxels)  # made here, and not by several threads at once
+        len(tile.voxels)  # made here, and not by several threads at once
     return found
 
 
@@ -235,10 +234,8 @@ class _Mesher:
         scale = self.tiles.config.scale
         wide = self._bounds(key).wider(scale * OVERLAP_M)
         cloud = self.tiles.cloud_in(wide)
-        wrong = None
-        if self.settings.free_space:
-            voxels = self.tiles.voxels_in(wide.wider(scale * _BULGE_M))
-            wrong = partial(looked_through, voxels=voxels) if len(voxels) else None
+        voxels = self.tiles.voxels_in(wide.wider(scale * _BULGE_M))
+        wrong = partial(looked_through, voxels=voxels) if len(voxels) else None
         settings, target = self.settings, self.settings.target_faces
         if target is not None:
             # By its fraction of the points.
@@ -247,7 +244,7 @@ class _Mesher:
         else:
             settings = settings.model_copy(update={"min_component_faces": 1})
         try:
-            if settings.map_surface == "voxels":
+            if settings.surface == "grid":
                 voxel_m = self.tiles.config.fusion.voxel_m
                 mesh = reconstruct_map_surface(cloud, settings, voxel_m, wrong)
             else:

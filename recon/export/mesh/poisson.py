@@ -34,6 +34,10 @@ _FARTHEST = 1000.0  # distance of a point from the middle, as a multiple of thei
 _SPACING_NEIGHBOURS = 7
 _SPACING_SAMPLES = 20_000
 _OCTREE_SCALE = 1.1  # MeshLab's octree is this much wider than the cloud
+POINT_WEIGHT: Final = 4.0  # of the points against their normals, of clouds with noise
+_LEAST_SUPPORTED: Final = 0.01  # of the vertices, which are cut off: bulges beyond the points
+_CELL_SPACINGS: Final = 1.5  # widest octree cell: noise becomes ripples in smaller ones
+_MAX_DEPTH: Final = 10  # that is chosen by the points: bounds time and memory
 Point = tuple[float, float, float]
 _NORMALS_NEIGHBOURS: Final = 20  # neighbours for normals where the cloud has none
 
@@ -41,26 +45,16 @@ _NORMALS_NEIGHBOURS: Final = 20  # neighbours for normals where the cloud has no
 class MeshSettings(Settings):
     """How a surface is reconstructed and trimmed."""
 
-    pair_surface: Literal["grid", "poisson"] = "grid"
-    """How the surface of a pair is made: from the grid of its pixels, in a second; or by MeshLab's
-    Poisson reconstruction, as those of clouds."""
+    surface: Literal["grid", "poisson"] = "grid"
+    """How the surface is made: from a grid, that of the pixels of a pair or that of the voxels of a
+    map, in seconds; or by MeshLab's Poisson reconstruction, which closes wider holes and is
+    smoother."""
     pair_solid_m: float | None = Field(None, gt=0, le=100_000.0)
     """Thickness of the surface of a pair, in metres behind it, as a closed body for printing; none
     = an open surface."""
-    map_surface: Literal["voxels", "poisson"] = "voxels"
-    """How the surface of a map is made: through the points of its voxels, in seconds; or by
-    MeshLab's Poisson reconstruction, which closes wider holes and is smoother."""
     depth: int | None = Field(None, ge=4, le=12)
-    """Octree depth; none = chosen by cell_spacings, up to max_depth. Each step halves the cells."""
-    cell_spacings: float = Field(1.5, ge=0.1, le=20)
-    """Widest octree cell, in point spacings; noise in smaller ones becomes ripples. Raise it for a
-    smoother surface."""
-    max_depth: int = Field(10, ge=4, le=12)
-    """Largest depth that is chosen automatically: bounds time and memory."""
-    point_weight: float = Field(4.0, ge=0, le=1000.0)
-    """Weight of the points against their normals. Lower is smoother."""
-    trim_density_quantile: float = Field(0.01, ge=0, lt=1)
-    """Fraction of the vertices cut off as least supported; 0 keeps all."""
+    """Octree depth of Poisson's; none = by the spacing of the points, at most 10. Each step halves
+    the cells, and takes four times the memory."""
     max_distance_spacings: float | None = Field(2.0, ge=0.01, le=1000000.0)
     """Farthest a vertex may lie from the points, in local point spacings; none = keep all. Lower it
     to keep holes open."""
@@ -75,15 +69,12 @@ class MeshSettings(Settings):
     texture_px: int = Field(8192, ge=64, le=16384)
     """Largest width and height of the picture of a textured map: what graphics cards take. Its
     texels are as wide as the pixels that saw the surface, wider where that is more."""
-    free_space: bool = True
-    """Remove surfaces in space that the cameras of a drive saw to be free. Off keeps what moved
-    through."""
 
     @model_validator(mode="after")
     def _check_solid(self) -> Self:
         if self.pair_solid_m is not None:
-            if self.pair_surface != "grid":
-                raise ValueError("pair_solid_m: only a surface with pair_surface=grid is closed")
+            if self.surface != "grid":
+                raise ValueError("pair_solid_m: only a surface with surface=grid is closed")
             if self.target_faces is not None:
                 raise ValueError("pair_solid_m: a simplified surface has gaps; no target_faces")
         return self
@@ -94,6 +85,7 @@ def reconstruct_mesh(
     settings: MeshSettings,
     viewpoint_m: Point | None = None,
     wrong: Callable[[Float32], Bool] | None = None,
+    point_weight: float = POINT_WEIGHT,
 ) -> TriangleMesh:
     """Reconstruct the surface that a cloud was sampled from.
 
@@ -107,6 +99,7 @@ def reconstruct_mesh(
         viewpoint_m: Where the points were seen from, if they have no normals; None = they are only
             made consistent, and may all be flipped.
         wrong: Returns which vertices (V, 3) cannot be on a surface; None = unknown.
+        point_weight: Weight of the points against their normals; lower is smoother.
 
     Returns:
         The mesh, with outward unit normals, and colours if the cloud has any.
@@ -117,12 +110,12 @@ def reconstruct_mesh(
     Ref: Kazhdan & Hoppe, "Screened Poisson surface reconstruction", ACM TOG 32(3), 2013.
     """
     cloud = oriented(cloud, viewpoint_m)
-    depth = settings.depth or _fitting_depth(cloud.xyz, settings)
+    depth = settings.depth or _fitting_depth(cloud.xyz)
     normals = np.asarray(cloud.normals)
     vertices, faces, density = screened_poisson(
-        cloud.xyz, normals, depth, _OCTREE_SCALE, settings.point_weight
+        cloud.xyz, normals, depth, _OCTREE_SCALE, point_weight
     )
-    supported = density >= np.quantile(density, settings.trim_density_quantile)
+    supported = density >= np.quantile(density, _LEAST_SUPPORTED)
     if settings.max_distance_spacings is not None:
         index, distance_m = open3d_clouds.nearest(vertices, cloud.xyz)
         near, where = np.unique(index[:, 0], return_inverse=True)
@@ -205,13 +198,13 @@ def oriented(cloud: PointCloud, viewpoint_m: Point | None = None) -> PointCloud:
     return replace(cloud, normals=normals)
 
 
-def _fitting_depth(xyz: Float32, settings: MeshSettings) -> int:
-    """Return the smallest octree depth whose cells are no wider than the settings allow."""
-    cell_m = settings.cell_spacings * typical_spacing_m(xyz)
+def _fitting_depth(xyz: Float32) -> int:
+    """Return the smallest octree depth whose cells are no wider than they may be."""
+    cell_m = _CELL_SPACINGS * typical_spacing_m(xyz)
     extent_m = float(np.ptp(xyz, axis=0).max()) * _OCTREE_SCALE
-    if cell_m * 2**settings.max_depth <= extent_m:
-        return settings.max_depth
-    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, settings.max_depth))
+    if cell_m * 2**_MAX_DEPTH <= extent_m:
+        return _MAX_DEPTH
+    return int(np.clip(math.ceil(math.log2(extent_m / cell_m)), _MIN_DEPTH, _MAX_DEPTH))
 
 
 def typical_spacing_m(xyz: Float32) -> float:

@@ -37,15 +37,17 @@ OCCUPIED_PROBABILITY: Final = 0.55
 FREE_PROBABILITY: Final = 0.35  # voxels at most this probable are free
 
 
+MIN_BLOB_CELLS: Final = 3  # fewer connected blocked cells are taken for noise
+
+
 class GridSettings(Settings):
     """How voxels are flattened. Heights are of centres of voxels, above the local ground."""
 
     min_height_m: float = Field(0.3, ge=0.0, le=10.0)
     """Lower end of the band in which obstacles are looked for: what the vehicle can drive over."""
     max_height_m: float = Field(2.0, ge=0.01, le=100.0)
-    """Upper end of the band: what is higher is passed under. The height of the vehicle."""
-    min_blob_cells: int = Field(3, ge=1, le=100_000_000)
-    """Connected blocked cells fewer than this are taken for noise. 1 keeps thin posts."""
+    """Upper end of the band: what is higher is passed under. The height of the vehicle, or of the
+    robot that a costmap is for."""
     vehicle_width_m: float = Field(0.6, ge=0.0, le=10.0)
     """Width of what carried the camera: cells that it passed over are free; 0 = only what was seen
     is free."""
@@ -86,7 +88,7 @@ def flatten(
     _, labels, stats, _ = cv2.connectedComponentsWithStats(
         blocked.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S
     )
-    blocked &= (stats[:, cv2.CC_STAT_AREA] >= s.min_blob_cells)[labels]
+    blocked &= (stats[:, cv2.CC_STAT_AREA] >= MIN_BLOB_CELLS)[labels]
     hit_low = number_in(hit & low_air) > 0
     free = (number_in(empty & low_air) > 0) & ~blocked & ~(hit_low & _beside(blocked))
     seen = number_in(empty & (height >= 0)) > 0

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from recon.core.errors import MappingError
 from recon.core.kernels.voxels import find_keys, pack_keys
-from recon.core.settings import Length, Settings
+from recon.core.settings import Settings
 from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int64, freeze
 from recon.core.values.grid import log_odds
@@ -41,9 +41,6 @@ _BEYOND: Final = np.iinfo(np.int32).max  # ring of the cells that are out of rea
 class GroundSettings(Settings):
     """How the ground is followed."""
 
-    reach_m: float = Length(25.0, ge=1e-06, le=100_000.0)
-    """How far from the path the surface grows, and with it the grid. Raise it with
-    occupancy.max_range_m."""
     camera_height_m: float | None = Field(None, ge=0.01, le=100.0)
     """Height of the camera above ground; none = measured. Set it where the ground near the path is
     not seen."""
@@ -116,14 +113,15 @@ class GroundSurface:
 
 
 def estimate_ground_surface(
-    cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings
+    cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings, reach_m: float
 ) -> GroundSurface:
     """Follow the ground along a path and to its sides; unknown everywhere without ground below it.
 
     Of a fused cloud with normals, only points that face up count. ``positions_m``, float (N, 3),
-    are those of the camera, map axes; a row of NaN separates pieces of a path.
+    are those of the camera, map axes; a row of NaN separates pieces of a path. The surface grows as
+    far from the path as ``reach_m``.
     """
-    field = _field(cloud, positions_m, settings)
+    field = _field(cloud, positions_m, reach_m)
     camera_height = settings.camera_height_m or field.camera_height()
     if math.isfinite(camera_height):
         field.grow(camera_height)
@@ -142,32 +140,32 @@ def estimate_ground_surface(
 
 
 def measure_camera_height(
-    cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings
+    cloud: PointCloud, positions_m: NDArray[Any], reach_m: float
 ) -> tuple[float, Float64]:
     """Return the commonest height of the camera above the ground, and that in cells of the path.
 
     NaN where no ground was found; cells, float64 (C,), are those with points below the path. Takes
     what `estimate_ground_surface` does.
     """
-    field = _field(cloud, positions_m, settings)
+    field = _field(cloud, positions_m, reach_m)
     drops = field.drops()
     return field.camera_height(), drops[np.isfinite(drops)]
 
 
-def _field(cloud: PointCloud, positions_m: NDArray[Any], settings: GroundSettings) -> _Field:
+def _field(cloud: PointCloud, positions_m: NDArray[Any], reach_m: float) -> _Field:
     if cloud.frame != "map":
         raise MappingError("ground is looked for in map axes", got=cloud.frame, expected="map")
     if not np.isfinite(positions_m).any():
         raise MappingError("ground is looked for below a path, and the path is empty")
-    return _Field(cloud, np.asarray(positions_m, dtype=np.float64), settings)
+    return _Field(cloud, np.asarray(positions_m, dtype=np.float64), reach_m)
 
 
 class _Field:
     """The surface while it grows."""
 
-    def __init__(self, cloud: PointCloud, path: Float64, settings: GroundSettings) -> None:
-        self.cell_m = cell = max(CELL_M, settings.reach_m / _MOST_RINGS)
-        rings = math.ceil(settings.reach_m / cell)
+    def __init__(self, cloud: PointCloud, path: Float64, reach_m: float) -> None:
+        self.cell_m = cell = max(CELL_M, reach_m / _MOST_RINGS)
+        rings = math.ceil(reach_m / cell)
         known = np.isfinite(path).all(axis=1)
         pieces = np.split(path, np.flatnonzero(np.diff(known)) + 1)
         known_pieces = [one for one in pieces if len(one) and np.isfinite(one[0]).all()]

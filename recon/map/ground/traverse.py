@@ -55,8 +55,6 @@ class RobotSettings(Settings):
     """Highest step, up or down; none = 0.4 of the radius, which driven wheels climb when wet."""
     max_slope_percent: float = Field(20.0, ge=0.1, le=200.0)
     """Steepest slope, in any direction."""
-    clearance_m: float = Field(2.0, ge=0.01, le=100.0)
-    """Height of the robot: it passes under what hangs higher above the ground."""
 
     @property
     def step_m(self) -> float:

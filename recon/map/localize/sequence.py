@@ -12,6 +12,7 @@ import numpy as np
 
 from recon.core.errors import MappingError, RegistrationError
 from recon.core.progress import series, stage
+from recon.core.settings import scaled
 from recon.core.summary import Figures, Rows, RunSummary, inline, shown_path
 from recon.core.text import counted, metres
 from recon.core.values import OccupancyGrid, Recorded, Trajectory
@@ -23,6 +24,7 @@ from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile, known_places
+from recon.odometry.kiss import RANGE_M
 from recon.odometry.protocol import OdometryFrame
 from recon.sources.source import SourceFigures, StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor
@@ -189,7 +191,7 @@ def open_localizer(
                 expected=f"one within {START_WITHIN_M:g} m and {START_WITHIN_DEG:g}°",
                 hint="x and y in metres and the heading in degrees, in map axes",
             )
-    return Localizer(known, Surroundings(map_, config.odometry.max_range_m), among=among)
+    return Localizer(known, Surroundings(map_, scaled(RANGE_M, config.scale)), among=among)
 
 
 def localize_sequence(

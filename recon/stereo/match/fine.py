@@ -74,10 +74,6 @@ _VOLUME_BYTES: Final = 448 << 20  # at most; larger images are matched in strips
 _OVERLAP_ROWS: Final = 64  # of strips
 
 
-class FineSettings(common.MeasuredSettings, common.FillableSettings):
-    """Settings of the fine matcher."""
-
-
 class FineMatcher:
     """Matches for quality, in seconds per megapixel; a `Matcher`.
 
@@ -85,7 +81,7 @@ class FineMatcher:
     effect on the result.
     """
 
-    def __init__(self, settings: FineSettings, threads: int | None = None) -> None:
+    def __init__(self, settings: common.SearchSettings, threads: int | None = None) -> None:
         self._settings = settings
         self._threads = max(1, threads or os.cpu_count() or 1)
         self._paths = sgm.PathSearch(self._threads)

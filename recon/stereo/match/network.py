@@ -95,7 +95,7 @@ class OnnxNetwork:
             return [np.asarray(output, dtype=np.float32) for output in self._outputs(feed)]
         except self._errors as error:
             what, got = "the network cannot process these images", _first_line(error)
-            hint = "check the size that it expects: matching.onnx.width_px and height_px"
+            hint = "check the size that it expects: matching.onnx.size_px"
             raise MatchingError(what, where=self._path, got=got, hint=hint) from error
 
     def _outputs(self, feed: dict[str, Float32]) -> list[Any]:
@@ -110,7 +110,7 @@ class OnnxNetwork:
                 options.terminate = True
         if late:
             what, got = "the network does not come to an end", f"{self._limit_s:g} s"
-            hint = "--set matching.onnx.time_limit_s= allows more"
+            hint = "give it smaller images: matching.onnx.size_px"
             raise MatchingError(what, where=self._path, got=got, hint=hint)
         return list(running.result())
 

@@ -28,7 +28,12 @@ from recon.stereo.match.protocol import unrated_disparity
 from recon.stereo.match.search import LEFT_RIGHT_PX, usual_ndisp
 
 _WHITE: Final = 255.0
+# Larger images are matched in tiles of so many pixels, where the network takes any size: a small
+# network needs 1 to 2 GB for them.
+_TILE_PX: Final = 1_000_000
+_TIME_LIMIT_S: Final = 600.0  # of an image or tile: one that never ends is refused
 Size = tuple[int, int]  # width and height
+_Length = Annotated[int, Field(ge=1, le=LARGEST_PX)]
 
 
 class OnnxSettings(Settings):
@@ -43,11 +48,9 @@ class OnnxSettings(Settings):
     preset: Literal["hitnet", "lite-any-stereo"] | None = None
     """Which published network it is: sets mean, std, output and output_scale, unless they are set,
     and names licence and training sets in the results."""
-    width_px: int | None = Field(None, ge=1, le=LARGEST_PX)
-    """Width at which the network matches; images are resized. none = its own, or that of the
-    images, widened to a multiple of 32. Smaller is faster."""
-    height_px: int | None = Field(None, ge=1, le=LARGEST_PX)
-    """Height at which it matches; with width_px or not at all."""
+    size_px: tuple[_Length, _Length] | None = None
+    """Width and height at which the network matches; images are resized. none = its own, or that of
+    the images, widened to a multiple of 32. Smaller is faster."""
     mean: tuple[Annotated[float, Field(ge=-1e6, le=1e6)], ...] | None = None
     """Taken from levels in [0, 1]; one number, or per channel (red, green, blue). none = 0, or as
     the preset says."""
@@ -62,19 +65,12 @@ class OnnxSettings(Settings):
     left_right: bool = True
     """Match the right view too, in twice the time: what both views agree on is kept, and how well
     they agree makes confidence and sigma_px. Else all matches have the same."""
-    tile_megapixels: float = Field(1.0, ge=0.1, le=1000)
-    """Larger images are matched in tiles of this size, which overlap; memory grows with it, by 1 to
-    2 GB per megapixel of a small network. Not where the network or width_px gives the size."""
-    time_limit_s: float = Field(600.0, ge=0.1, le=1e6)
-    """The longest that the network may take of an image or tile: one that never ends is refused."""
     self_test: bool = True
     """Let the network match a rendered plane first, and refuse it if it does not find the
     disparity."""
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
-        if (self.width_px is None) != (self.height_px is None):
-            raise ValueError("width_px and height_px are given together or not at all")
         if any(one is not None and len(one) not in {1, 3} for one in (self.mean, self.std)):
             raise ValueError("mean and std have one number, or one for each of three channels")
         return self
@@ -84,13 +80,6 @@ class OnnxSettings(Settings):
         names = ("mean", "std", "output", "output_scale")
         own = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return replace(PRESETS[self.preset] if self.preset else OWN, **own)
-
-    @property
-    def size(self) -> Size | None:
-        """Width and height at which it matches, if they are set."""
-        if self.width_px is None or self.height_px is None:
-            return None
-        return self.width_px, self.height_px
 
 
 @dataclass(frozen=True)
@@ -135,7 +124,7 @@ class OnnxMatcher:
             return unrated_disparity(found, reason, pair)
         # Seen in a mirror, the right view is the left one of a pair.
         of_right = self._disparity(network, right[:, ::-1], left[:, ::-1], reach_px)[:, ::-1]
-        size = self._settings.size or network.size
+        size = self._settings.size_px or network.size
         limit = LEFT_RIGHT_PX * max(1.0, left.shape[1] / size[0] if size else 1.0)
         return rate_by_agreement(found, of_right, pair, limit)
 
@@ -146,7 +135,7 @@ class OnnxMatcher:
                 get = f": {self._use.get}" if self._use.get else ""
                 what, hint = "the matcher 'onnx' needs a network", "--set matching.onnx.model=FILE"
                 raise SettingsError(what, expected=f"a file{get}", hint=hint)
-            network = OnnxNetwork(path, self._threads, s.time_limit_s)
+            network = OnnxNetwork(path, self._threads, _TIME_LIMIT_S)
             if self._use.layout not in {"", network.layout}:
                 what, hint = f"not the network of the preset {s.preset!r}", f"get {self._use.get}"
                 how = {"got": network.layout, "expected": self._use.layout, "hint": hint}
@@ -156,13 +145,13 @@ class OnnxMatcher:
                 def match(left: UInt8, right: UInt8) -> Float32:
                     return self._disparity(network, left, right, left.shape[1])
 
-                check_network(match, s.size or network.size, self._use.output_scale, path)
+                check_network(match, s.size_px or network.size, self._use.output_scale, path)
             self._network = network
         return self._network
 
     def _disparity(self, network: OnnxNetwork, left: UInt8, right: UInt8, reach_px: int) -> Float32:
         """Return float32 (H, W) of the left of two views, pixels, NaN = none."""
-        size = self._settings.size or network.size
+        size = self._settings.size_px or network.size
         (height, width), multiple = left.shape[:2], self._use.multiple_px
         views = _fitted(left, size, multiple), _fitted(right, size, multiple)
 
@@ -172,7 +161,7 @@ class OnnxMatcher:
                 inputs = [np.concatenate(inputs, axis=1)]
             return _resized(self._disparity_of(network.run(inputs)), views[0].shape[:2])
 
-        most = int(1e6 * self._settings.tile_megapixels) if size is None else views[0].size
+        most = _TILE_PX if size is None else views[0].size
         values = match_in_tiles(match, views, reach_px, most, multiple)
         return values[:height, :width] if size is None else _resized(values, (height, width))
 

@@ -1,8 +1,8 @@
 """OpenCV's block matcher and its semi-global matcher, to compare with.
 
 What changes at this border: OpenCV gives 16ths of a pixel, and ``(minimum - 1) · 16`` where it
-found nothing; it skips the columns that the whole range does not fit, unless `OpencvSettings.pad`
-widens the images.
+found nothing; it skips the columns that the whole range does not fit, unless it is to `pad` the
+images.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from pydantic import Field
 
 from recon.core.errors import MatchingError
+from recon.core.settings import Settings
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.stereo.match.protocol import unrated_disparity
-from recon.stereo.match.search import LEFT_RIGHT_PX, FillableSettings, OddInt
+from recon.stereo.match.search import LEFT_RIGHT_PX, SearchSettings
 
 _STEPS: Final = 16  # OpenCV counts in 16ths of a pixel, and searches multiples of 16 disparities
 _LIMIT_PX: Final = 2**15 // _STEPS - 1  # 16ths of a pixel are counted in 16 bits
@@ -32,36 +32,36 @@ _BM_BLOCK_PX: Final = 9  # where the settings name none, as below
 _SGBM_BLOCK_PX: Final = 3  # a single window of SGBM smooths by its paths instead
 
 
-class OpencvSettings(FillableSettings):
+class OpencvSettings(Settings):
     """Settings of `opencv-bm` (``cv2.StereoBM``) and `opencv-sgbm` (``cv2.StereoSGBM``)."""
 
     pad: bool = False
     """Widen the images by repeating their edges, so that every pixel is searched as far as the
     right image reaches. false = OpenCV as it comes, without a strip at the left as wide as the
     range, which scoring then fills by a guess."""
-    block_px: OddInt | None = Field(None, ge=1, le=255)
-    """Width of the window; odd. none = 9 for `opencv-bm` (at least 5), 3 for `opencv-sgbm`."""
 
 
 class OpencvMatcher:
     """A matcher of OpenCV, ``cv2.StereoBM`` or ``cv2.StereoSGBM``; the process sets its threads."""
 
-    def __init__(self, settings: OpencvSettings, *, semi_global: bool) -> None:
-        self._settings = settings
+    def __init__(
+        self, settings: SearchSettings, opencv: OpencvSettings, *, semi_global: bool
+    ) -> None:
+        self._settings, self._pad = settings, opencv.pad
         self._semi_global = semi_global
 
     def match(self, pair: RectifiedPair) -> Disparity:
         s, ndisp = self._settings, _range(self._settings, pair.camera)
-        block_px = s.block_px or (_SGBM_BLOCK_PX if self._semi_global else _BM_BLOCK_PX)
+        block_px = s.window_px or (_SGBM_BLOCK_PX if self._semi_global else _BM_BLOCK_PX)
         make = _semi_global_engine if self._semi_global else _block_engine
         above, before, after = 0, 0, 0
-        if s.pad:  # what OpenCV leaves out
+        if self._pad:  # what OpenCV leaves out
             above, high = block_px // 2 + 1, s.min_disparity_px + ndisp - 1
             before, after = above + max(0, high), above + max(0, -s.min_disparity_px)
         return _match(pair, make(s, ndisp, block_px), s, (above, above, before, after))
 
 
-def _block_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.StereoBM:
+def _block_engine(s: SearchSettings, ndisp: int, block_px: int) -> cv2.StereoBM:
     engine = cv2.StereoBM.create(ndisp, block_px)
     engine.setMinDisparity(s.min_disparity_px)
     engine.setPreFilterType(cv2.STEREO_BM_PREFILTER_XSOBEL)
@@ -72,7 +72,7 @@ def _block_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.StereoBM:
     return engine
 
 
-def _semi_global_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.StereoSGBM:
+def _semi_global_engine(s: SearchSettings, ndisp: int, block_px: int) -> cv2.StereoSGBM:
     return cv2.StereoSGBM.create(
         minDisparity=s.min_disparity_px,
         numDisparities=ndisp,
@@ -87,7 +87,7 @@ def _semi_global_engine(s: OpencvSettings, ndisp: int, block_px: int) -> cv2.Ste
 
 
 def _match(
-    pair: RectifiedPair, engine: Any, s: OpencvSettings, sides: tuple[int, int, int, int]
+    pair: RectifiedPair, engine: Any, s: SearchSettings, sides: tuple[int, int, int, int]
 ) -> Disparity:
     """Let OpenCV match images widened above, below, left and right by so many pixels.
 
@@ -111,7 +111,7 @@ def _match(
     return found.reject(kept == unknown, Reason.SPECKLE)
 
 
-def _range(settings: OpencvSettings, camera: RectifiedCamera) -> int:
+def _range(settings: SearchSettings, camera: RectifiedCamera) -> int:
     ndisp = _STEPS * -(-settings.ndisp_for(camera) // _STEPS)
     first, last = settings.min_disparity_px, settings.min_disparity_px + ndisp - 1
     if first <= -_LIMIT_PX or last >= _LIMIT_PX:

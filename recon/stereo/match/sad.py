@@ -13,7 +13,6 @@ from typing import Final, TypeVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from recon.core.values import Disparity, RectifiedPair
 from recon.core.values.arrays import Float32, UInt8
@@ -44,24 +43,13 @@ _COST_CAP: Final = 20
 WINDOW_SLANT: Final = 1 / 3
 RADIUS_PX: Final = 3  # half the window at half size: with that of full size thin things are lost
 UNIQUENESS_PERCENT: Final = 5
+_WINDOW_PX, _MOST_WINDOW_PX = 11, 55  # usual and widest edge of the window: its costs fit 16 bits
+_UNIQUENESS_PERCENT: Final = 2  # of a search at full size; at half size more is asked
 LEAST_NDISP: Final = 32  # with fewer candidates a search at half size takes longer than it saves
 TILE_HEIGHT_PX: Final = 16
 _TILE_COLUMNS: Final = 160  # columns of a tile together with those that its windows reach over
 # How much support at half size offers candidates to a tile.
 SUPPORT: Final = Support(margin_x=8, margin_y=8, margin=3, matched=0.15, ratio=0.03, least=4)
-
-
-class SadSettings(common.MeasuredSettings, common.FillableSettings):
-    """Settings of the SAD matcher."""
-
-    window_px: common.OddInt = Field(11, ge=1, le=55)
-    """Edge of the square window; odd. Smaller keeps thin things and sharp edges, larger is denser
-    where texture is weak."""
-    uniqueness_percent: common.UniquenessPercent = 2
-
-    @property
-    def reach_px(self) -> int:
-        return self.window_px // 2
 
 
 class SadMatcher:
@@ -73,23 +61,27 @@ class SadMatcher:
     """
 
     def __init__(
-        self, settings: SadSettings, threads: int | None = None, *, average: bool = True
+        self, settings: common.SearchSettings, threads: int | None = None, *, average: bool = True
     ) -> None:
         self._settings = settings
+        self._window_px = settings.window_within(_WINDOW_PX, _MOST_WINDOW_PX)
+        self.reach_px = self._window_px // 2
         self._average = average
         self._threads = max(1, threads or os.cpu_count() or 1)
         self._full = _StripSearch(self._threads)
         self._half = _StripSearch(self._threads)
 
     def match(self, pair: RectifiedPair) -> Disparity:
-        s = self._settings
-        ndisp, radius = s.ndisp_within(pair.camera), s.window_px // 2
+        s, radius = self._settings, self.reach_px
+        ndisp = s.ndisp_within(pair.camera)
         # The middles of the two halves lie half a radius above and below the pixel.
         slant = math.floor(WINDOW_SLANT * radius / 2 + 0.5)
         search = Search(ndisp, s.min_disparity_px, radius, radius, _COST_CAP, slant)
-        rules = common.rules_of(s, ndisp, s.window_px**2, min_texture=_MIN_TEXTURE)
+        rules = common.rules_of(
+            s, ndisp, self._window_px**2, min_texture=_MIN_TEXTURE, uniqueness=_UNIQUENESS_PERCENT
+        )
         with ThreadPoolExecutor(self._threads) as pool:
-            enough = partial(common.texture, pair, s.window_px)
+            enough = partial(common.texture, pair, self._window_px)
             tiles = self._tiles(pool, pair, search)
             refined = self._full.find(pool, (pair.left, pair.right), search, tiles, rules, enough)
             return common.finish(refined, pool, self._threads, average=self._average)
@@ -105,7 +97,7 @@ class SadMatcher:
         valid = None if pair.valid is None else pair.valid[::2, ::2]
         asked = partial(common.no_texture, shape[1], valid)
         # What makes a match at half size reliable.
-        own = SadSettings(min_disparity_px=minimum, uniqueness_percent=UNIQUENESS_PERCENT)
+        own = common.SearchSettings(min_disparity_px=minimum, uniqueness_percent=UNIQUENESS_PERCENT)
         rules = common.rules_of(own, ndisp, (2 * RADIUS_PX + 1) ** 2)._replace(fit=False)
         whole = undivided(halved, shape)
         found = self._half.find(pool, views, halved, whole, rules, asked)
@@ -221,7 +213,7 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     wholes = (im[: size[1] * factor, : size[0] * factor] for im in (pair.left, pair.right))
     left, right = (cv2.resize(whole, size, interpolation=cv2.INTER_AREA) for whole in wholes)
     small = RectifiedPair(np.asarray(left, np.uint8), np.asarray(right, np.uint8), camera)
-    settings = SadSettings(window_px=7, uniqueness_percent=10)
+    settings = common.SearchSettings(window_px=7, uniqueness_percent=10)
     found = SadMatcher(settings, threads=1, average=False).match(small)
     trusted = found.values[found.valid & (found.confidence >= _CONFIDENCE)]
     if trusted.size < _LEAST_MATCHES:
@@ -233,7 +225,7 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
 
 Number = TypeVar("Number", np.float32, np.uint8)
 
-_WINDOW_PX: Final = 7  # edge of the window at half size: nearly that of `sad` at full size
+_HALF_WINDOW_PX: Final = 7  # edge of the window at half size: nearly that at full size
 
 
 class HalfSizeMatcher:
@@ -244,8 +236,8 @@ class HalfSizeMatcher:
     """
 
     def __init__(self, searched: common.SearchSettings, threads: int | None = None) -> None:
-        half = SadSettings(
-            window_px=_WINDOW_PX,
+        half = common.SearchSettings(
+            window_px=_HALF_WINDOW_PX,
             min_disparity_px=searched.min_disparity_px // 2,
             ndisp=None if searched.ndisp is None else max(3, -(-searched.ndisp // 2)),
         )

@@ -7,14 +7,14 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from typing import Annotated, Final, Generic, TypeVar
+from typing import Annotated, Final, Generic, Literal, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
-from recon.core.errors import MatchingError
+from recon.core.errors import MatchingError, SettingsError
 from recon.core.settings import Settings
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.core.values.arrays import Bool, Float32, UInt8
@@ -39,19 +39,9 @@ def _odd(value: int) -> int:
 
 OddInt = Annotated[int, AfterValidator(_odd)]  # a width with a pixel in its middle
 
-UniquenessPercent = Annotated[
-    int,
-    Field(
-        ge=0,
-        le=100,
-        description="By how much the second best cost must exceed the best; 0 = no check. Raise it "
-        "where repeated structures (fences, tiles) leave wrong matches.",
-    ),
-]
-
 
 class SearchSettings(Settings):
-    """Which disparities are searched."""
+    """What is searched, in which windows, and what is done with the holes; for all matchers."""
 
     min_disparity_px: int = Field(0, ge=-4096, le=4096)
     """First disparity searched; negative for cameras that converge."""
@@ -59,6 +49,29 @@ class SearchSettings(Settings):
     """Number of disparities searched (OpenCV: rounded up to a multiple of 16). none = what the
     calibration says, or else as far as each pair needs. Time and memory grow with it; what is
     nearer than its last disparity is not found."""
+    window_px: OddInt | None = Field(None, ge=1, le=255)
+    """Edge of the square window; odd. none = 11 of `sad` (at most 55), 5 of `sgm` (at most 31), 9
+    of `opencv-bm` (at least 5), 3 of `opencv-sgbm`; `fine` has none. Smaller keeps thin things and
+    sharp edges, larger is denser where texture is weak."""
+    uniqueness_percent: int | None = Field(None, ge=0, le=100)
+    """By how much the second best cost must exceed the best; 0 = no check. none = 2 of `sad`, 0 of
+    `sgm` and `fine`; OpenCV's matchers have their own. Raise it where repeated structures (fences,
+    tiles) leave wrong matches."""
+    fill: bool | Literal["ours"] = False
+    """Decide by the look of the image what windows cannot: take back what they gave to the wrong
+    side of a step of depth, and infer what lies in a gap of a plane, marked as filled and kept
+    apart from what was measured. Takes some tenths of a second per megapixel; false has what the
+    windows found; ours = for `sad`, `sgm` and `fine`, not for OpenCV's matchers."""
+
+    def window_within(self, usual_px: int, most_px: int) -> int:
+        """Return the edge of the window of a matcher, which takes none wider than ``most_px``."""
+        window_px = self.window_px or usual_px
+        if window_px > most_px:
+            what = "the window is too wide for this matcher"
+            raise SettingsError(
+                what, where="matching.window_px", got=window_px, expected=f"at most {most_px}"
+            )
+        return window_px
 
     def ndisp_for(self, camera: RectifiedCamera) -> int:
         """Return the number of disparities to search in the images of a camera."""
@@ -78,41 +91,22 @@ class SearchSettings(Settings):
         return ndisp
 
 
-class FillableSettings(SearchSettings):
-    """Settings of the matchers that leave out what they do not find."""
-
-    fill: bool = False
-    """Settle by the look of the image what windows cannot: take back what they gave to the wrong
-    side of a step of depth, and infer what lies in a gap of a plane, marked as filled and kept
-    apart from what was measured. Takes some tenths of a second per megapixel. Turn it off to have
-    what the windows found."""
-
-    @property
-    def reach_px(self) -> int:
-        """How far from a step of depth windows mix its sides; 0 = they do not."""
-        return 0
-
-
-class MeasuredSettings(SearchSettings):
-    """Settings of the matchers with sub-pixel disparities and uncertainties of their own."""
-
-    uniqueness_percent: UniquenessPercent = 0
-
-
 def rules_of(
-    settings: MeasuredSettings,
+    settings: SearchSettings,
     ndisp: int,
     window_pixels: int,
     *,
     min_texture: float = 0.0,
+    uniqueness: int = 0,
     odds: float = ODDS,
 ) -> Rules:
-    """Return what the checks ask for, by the settings."""
+    """Return what the checks ask for, by the settings; ``uniqueness`` holds where they say none."""
+    asked = settings.uniqueness_percent
     return Rules(
         ndisp=ndisp,
         minimum=settings.min_disparity_px,
         texture=min_texture,
-        uniqueness=settings.uniqueness_percent,
+        uniqueness=uniqueness if asked is None else asked,
         left_right=LEFT_RIGHT_PX,
         window_pixels=window_pixels,
         sigma_floor_px=_SIGMA_FLOOR_PX,

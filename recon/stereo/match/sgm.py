@@ -8,14 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Final
 
-from pydantic import Field, model_validator
-from typing_extensions import Self
-
 from recon.core.values import Disparity, RectifiedPair
 from recon.stereo.kernels.minima import empty_minima
 from recon.stereo.kernels.path_costs import (
     CENSUS_RADIUS,
     Views,
+    Window,
     WriteCosts,
     empty_planes,
     scaled_window,
@@ -43,31 +41,13 @@ LARGEST_COST: Final = COST_CAP + (2 * CENSUS_RADIUS + 1) ** 2 - 1
 # Where the image changes by more along a path, large steps are cheaper: surfaces end there.
 EDGE_GREY_LEVELS: Final = 12
 EDGE_P2_SHARE: Final = 0.25  # fraction of P2 that is left there
+# Penalties of a step of one disparity along a path, and of a larger one, as mean costs of a pixel.
+# A smaller P1 is for slanted surfaces, a larger P2 fills more of what is plain, a smaller one keeps
+# thin things: all tables of docs/results.md are of these two, and no rig has asked for others.
+_P1, _P2 = 16.0, 50.0
+_WINDOW_PX, _MOST_WINDOW_PX = 5, 31  # usual and widest edge of the window
 _OVERLAP_ROWS: Final = 4  # rows that strips share, for vertical paths to start in
 _MEMORY_BYTES: Final = 1536 << 20  # what strips that are worked on at once need together, at most
-
-
-class SgmSettings(common.MeasuredSettings, common.FillableSettings):
-    """Settings of the semi-global matcher."""
-
-    window_px: common.OddInt = Field(5, ge=1, le=31)
-    """Edge of the square window; odd. Larger suppresses noise and widens edges."""
-    p1: float = Field(16.0, gt=0.0, le=255.0)
-    """Penalty of a step of one disparity along a path, as a mean cost of one pixel. Smaller where
-    most surfaces are slanted."""
-    p2: float = Field(50.0, gt=0.0, le=1000.0)
-    """Penalty of a larger step along a path, as a mean cost of one pixel. Larger is smoother, and
-    fills more of what is plain; smaller keeps thin things."""
-
-    @property
-    def reach_px(self) -> int:
-        return self.window_px // 2 + 1  # paths carry on what windows say
-
-    @model_validator(mode="after")
-    def _penalties_fit(self) -> Self:
-        if self.p1 > self.p2:
-            raise ValueError("p1 must not exceed p2")
-        return self
 
 
 class SgmMatcher:
@@ -77,8 +57,10 @@ class SgmMatcher:
     ``threads`` (None = all cores) has no effect on the result.
     """
 
-    def __init__(self, settings: SgmSettings, threads: int | None = None) -> None:
+    def __init__(self, settings: common.SearchSettings, threads: int | None = None) -> None:
         self._settings = settings
+        self._window = _window(settings.window_within(_WINDOW_PX, _MOST_WINDOW_PX) // 2)
+        self.reach_px = self._window.radius + 1  # paths carry on what windows say
         self._threads = max(1, threads or os.cpu_count() or 1)
         self._planes = common.ScratchPool(empty_planes, 1)
         self._search = PathSearch(self._threads)
@@ -86,14 +68,8 @@ class SgmMatcher:
     def match(self, pair: RectifiedPair) -> Disparity:
         s = self._settings
         ndisp = s.ndisp_within(pair.camera)
-        window = scaled_window(
-            radius=s.window_px // 2,
-            rows_radius=s.window_px // 2,
-            gradient_cap=COST_CAP,
-            largest=LARGEST_COST,
-            levels=LEVELS / (LARGEST_COST + s.p1 + s.p2),
-        )
-        paths = paths_of(ndisp, s.min_disparity_px, s.p1, s.p2, window.levels)
+        window = self._window
+        paths = paths_of(ndisp, s.min_disparity_px, _P1, _P2, window.levels)
         # A cost is about so many times the mean cost of a pixel.
         rules = common.rules_of(s, ndisp, max(1, round(PARTS * window.levels)), odds=ODDS)
         with self._planes.borrow(*pair.left.shape, window.radius, ndisp) as planes:
@@ -149,6 +125,16 @@ class PathSearch:
                 list(pool.map(prepare, strips))
             list(pool.map(search, strips))
             return common.finish(refined, pool, at_once)
+
+
+def _window(radius: int) -> Window:
+    return scaled_window(
+        radius=radius,
+        rows_radius=radius,
+        gradient_cap=COST_CAP,
+        largest=LARGEST_COST,
+        levels=LEVELS / (LARGEST_COST + _P1 + _P2),
+    )
 
 
 def paths_of(ndisp: int, minimum: int, p1: float, p2: float, levels: float) -> Paths:

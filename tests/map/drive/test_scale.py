@@ -44,7 +44,7 @@ def test_scale_follows_from_depth_and_what_the_rig_can_place(depth_m, sigma_m, s
 
 
 def test_lengths_that_are_set_stay_and_the_others_follow_once():
-    given = load_config(None, ["fusion.voxel_m=0.03", "map_filters.voxel_m=0.01"])
+    given = load_config(None, ["fusion.voxel_m=0.03"])
     fitted = given.at_scale(0.2)
     assert (fitted.fusion.voxel_m, fitted.fusion.max_depth_error_m) == (0.03, 0.05)
     assert (fitted.map_filters.radius_m, fitted.mesh.tile_m, fitted.scale) == (0.06, 10.0, 0.2)

@@ -111,14 +111,14 @@ def test_unknown_stays_unknown():
     assert (_flatten(low, _ground()).cells == FREE).all()
 
 
-@pytest.mark.parametrize(("low", "high", "setting", "cells"), [
-    ((1, 0, 1.0), (2, 4, 1.4), {"max_height_m": 3.0}, 100),  # a bridge above the band
-    ((1, 1, -1), (1.2, 1.4, -0.6), {"min_blob_cells": 1}, 2),  # a speck
-])  # fmt: skip
-def test_what_is_driven_under_or_taken_for_noise_is_a_setting(low, high, setting, cells):
-    voxels = _voxels(*_road((0, 0), (4, 4)), (_box(low, high), 2.0))
-    assert (_flatten(voxels, _ground()).cells == FREE).all()
-    assert (_flatten(voxels, _ground(), **setting).cells == OCCUPIED).sum() == cells
+def test_a_bridge_is_driven_under_by_the_height_that_is_set_and_a_speck_is_noise(monkeypatch):
+    bridge = _voxels(*_road((0, 0), (4, 4)), (_box((1, 0, 1.0), (2, 4, 1.4)), 2.0))
+    speck = _voxels(*_road((0, 0), (4, 4)), (_box((1, 1, -1), (1.2, 1.4, -0.6)), 2.0))
+    assert (_flatten(bridge, _ground()).cells == FREE).all()
+    assert (_flatten(bridge, _ground(), max_height_m=3.0).cells == OCCUPIED).sum() == 100
+    assert (_flatten(speck, _ground()).cells == FREE).all()
+    monkeypatch.setattr(grid_file, "MIN_BLOB_CELLS", 1)
+    assert (_flatten(speck, _ground()).cells == OCCUPIED).sum() == 2
 
 
 def test_what_was_hit_behind_a_wall_belongs_to_it(monkeypatch):
@@ -360,9 +360,9 @@ def _path() -> np.ndarray:
     return path
 
 
-def _surface(points: np.ndarray, **settings: float) -> GroundSurface:
+def _surface(points: np.ndarray, reach_m: float = 25.0, **settings: float) -> GroundSurface:
     cloud = PointCloud(points.astype(np.float32), frame="map")
-    return ground_file.estimate_ground_surface(cloud, _path(), GroundSettings(**settings))
+    return ground_file.estimate_ground_surface(cloud, _path(), GroundSettings(**settings), reach_m)
 
 
 @pytest.mark.parametrize(("points", "path", "words"), [
@@ -371,7 +371,7 @@ def _surface(points: np.ndarray, **settings: float) -> GroundSurface:
 ])  # fmt: skip
 def test_wrong_input_is_refused(points, path, words):
     with pytest.raises(MappingError, match=words):
-        ground_file.estimate_ground_surface(points, path, GroundSettings())
+        ground_file.estimate_ground_surface(points, path, GroundSettings(), 25.0)
 
 
 def _error(surface: GroundSurface, half_width: float = 10.0) -> np.ndarray:
@@ -389,7 +389,9 @@ def test_slopes_are_followed():
     assert given.camera_height_m == CAMERA_M
     assert np.abs(_error(given)).max() < 0.1
     cloud = PointCloud(_hill().astype(np.float32), frame="map")
-    of_one_frame = ground_file.estimate_ground_surface(cloud, _path()[30:31], GroundSettings())
+    of_one_frame = ground_file.estimate_ground_surface(
+        cloud, _path()[30:31], GroundSettings(), 25.0
+    )
     height_m = float(_slope(np.array(33.0), np.array(2.0)))
     assert of_one_frame.height_at(np.array([[33.0, 2.0]]))[0] == pytest.approx(height_m, abs=0.1)
 
@@ -414,7 +416,7 @@ def test_normals_tell_the_ground_from_the_rest():
     normals[:20_000, 2] = 1
     normals[20_000:, 1] = 1
     cloud = PointCloud(np.vstack([ground, hedge]).astype(np.float32), normals=normals, frame="map")
-    surface = ground_file.estimate_ground_surface(cloud, _path(), GroundSettings())
+    surface = ground_file.estimate_ground_surface(cloud, _path(), GroundSettings(), 25.0)
     assert np.abs(_error(surface)).max() < 0.15
     without = _surface(np.vstack([ground, hedge]))
     assert np.abs(np.nanmean(_error(without))) > 2 * abs(np.nanmean(_error(surface)))
@@ -479,10 +481,8 @@ def test_the_ground_reaches_as_far_as_the_voxels(monkeypatch):
     cloud = PointCloud(near.astype(np.float32), frame="map")
     place = np.array([[18.0, 0.5]])
     monkeypatch.setattr(ground_file, "_MAX_GAP_M", 2.0)
-    settings = GroundSettings()
-    assert np.isnan(
-        ground_file.estimate_ground_surface(cloud, path, settings).height_at(place)
-    ).all()
+    how = (GroundSettings(), 25.0)
+    assert np.isnan(ground_file.estimate_ground_surface(cloud, path, *how).height_at(place)).all()
     floor = add_floors(cloud, find_floors(_joined(long)))
-    height = ground_file.estimate_ground_surface(floor, path, settings).height_at(place)
+    height = ground_file.estimate_ground_surface(floor, path, *how).height_at(place)
     assert height == pytest.approx(-7.5 * EDGE_M, abs=0.01)

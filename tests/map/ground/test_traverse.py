@@ -190,7 +190,7 @@ def test_where_a_vehicle_drove_nothing_is_unknown():
     ("name", "value"),
     [
         ("width_m", 0.0), ("width_m", -1.0), ("width_m", "nan"), ("wheel_radius_m", 0.0),
-        ("clearance_m", -2.0), ("max_step_m", 0.0), ("max_slope_percent", -5.0),
+        ("max_step_m", 0.0), ("max_slope_percent", -5.0),
     ],
 )  # fmt: skip
 def test_robots_that_cannot_be_are_refused_in_one_line(name, value):

@@ -24,7 +24,7 @@ name = "one.pair"
 command = "pair"
 source = ["left.png", "right.png"]
 """
-SWEEP = '[sweep]\n"matching.sad.window_px" = [9, 11]\n"matching.matcher" = ["sad", "sgm"]\n'
+SWEEP = '[sweep]\n"matching.window_px" = [9, 11]\n"matching.matcher" = ["sad", "sgm"]\n'
 
 
 def write(folder: Path, text: str, suffix: str = "toml") -> Path:

@@ -10,7 +10,7 @@ from recon.commands.config import load_config
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.fill import fill
-from recon.stereo.match.registry import field_of, make_matcher
+from recon.stereo.match.registry import make_matcher
 
 HEIGHT, WIDTH = 120, 260
 Y, X = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
@@ -112,9 +112,8 @@ def test_any_matcher_fills_what_is_plain_and_leaves_the_half_shadow(matcher):
     square = rng.uniform(0, 255, (60, 30))
     left[30:90, 60:90], right[30:90, 40:70] = square, square
     noisy = [np.clip(np.rint(v + rng.normal(0, 0.7, v.shape)), 0, 255) for v in (left, right)]
-    own = f"matching.{field_of(matcher)}"
     matching, unfilled = (
-        load_config(None, [f"{own}.ndisp=48", f"{own}.fill={fill}"]).matching
+        load_config(None, ["matching.ndisp=48", f"matching.fill={fill}"]).matching
         for fill in ("true", "false")
     )
     pair = pair_of(*noisy)

@@ -16,8 +16,10 @@ from recon.stereo.kernels.convolution import UNIT
 from recon.stereo.match import fill, fine, sgm
 from recon.stereo.match.fine import Describer, fine_grey, load_network
 from recon.stereo.match.registry import MatchingSettings, make_matcher
+from recon.stereo.match.search import SearchSettings
 
 HEIGHT, WIDTH = 120, 240
+SETTINGS = SearchSettings(ndisp=48)
 
 
 def rendered(truth: np.ndarray, texture: np.ndarray, noise: float = 1.0) -> RectifiedPair:
@@ -45,7 +47,7 @@ def ground() -> np.ndarray:
 
 
 def match(pair: RectifiedPair, threads: int | None = None, **settings: int) -> Disparity:
-    asked = MatchingSettings.parse({"fine": {"ndisp": 48, "fill": True, **settings}})
+    asked = MatchingSettings.parse({"ndisp": 48, "fill": True, **settings})
     return make_matcher("fine", asked, threads).match(pair)
 
 
@@ -70,7 +72,7 @@ def test_what_is_plain_is_filled_as_planes_around_it_go_on_and_said():
     assert 0.15 < filled[plain].mean() < 0.3
     assert not filled[85:, 60:].any()
     assert (error[plain][filled[plain]] < 1).mean() > 0.95
-    only = sgm.SgmMatcher(sgm.SgmSettings(ndisp=48)).match(pair)
+    only = sgm.SgmMatcher(SETTINGS).match(pair)
     assert (np.abs(only.values - truth)[plain] < 1).mean() < 0.3
     seen = found.reason == Reason.VALID
     assert np.median(found.sigma_px[filled]) > 2 * np.median(found.sigma_px[seen])

@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 
 import recon
+from recon.commands.config import list_settings, load_config
 from recon.core.errors import MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.io.middlebury import stand_in_camera
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
+from recon.stereo.match.search import SearchSettings
 
 
 def install_plugin(site, package, modules, points, group="matchers"):
@@ -124,7 +126,7 @@ def test_no_match_is_kept_where_there_is_no_image_and_the_range_is_named():
     [
         (Flat, {}, r"class.*Flat\(\)"),
         (7, {}, "not usable as matcher.*int"),
-        (Flat(), {"ndisp": 16}, r"only recon's own matchers take settings.*ndisp"),
+        (Flat(), {"ndisp": 16}, r"takes no settings here.*ndisp"),
     ],
 )
 def test_what_is_no_matcher_or_takes_no_settings_is_refused(given, settings, word):
@@ -169,7 +171,7 @@ def plugin(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("plugin")
 def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
     assert np.nanmedian(recon.match(image(), image(), matcher="flat").values) == 7
-    made = make_matcher("sad", MatchingSettings.parse({"sad": {"ndisp": 16}}))
+    made = make_matcher("sad", MatchingSettings(ndisp=16))
     assert type(made) is MATCHERS["sad"]
     with pytest.raises(SettingsError, match=r"unknown matcher.*'cencus'.*fails, fine, flat.*sad"):
         recon.match(image(), image(), matcher="cencus")
@@ -197,6 +199,62 @@ def test_a_broken_plugin_is_named_in_one_line(name, words):
     assert "of package flat-matcher" in str(raised.value)
 
 
+SET = """
+import numpy as np
+from pydantic import Field
+from recon import Disparity
+from recon.core.settings import Settings
+
+class LevelSettings(Settings):
+    \"\"\"How a level is guessed.\"\"\"
+
+    level_px: float = Field(7.0, ge=0.0, le=100.0)
+    \"\"\"Disparity of every pixel.\"\"\"
+
+class Level:
+    settings = LevelSettings
+
+    def __init__(self, settings):
+        self.level_px = settings.level_px
+
+    def match(self, pair):
+        return Disparity.from_values(np.full(pair.left.shape, self.level_px))
+"""
+
+
+@pytest.fixture
+def with_settings(tmp_path, monkeypatch):
+    points = {"my-level": "level_matcher:Level"}
+    install_plugin(tmp_path, "level-matcher", {"level_matcher.py": SET}, points)
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+
+@pytest.mark.usefixtures("with_settings")
+def test_the_settings_that_a_plugin_brings_are_checked_shown_recorded_and_handed_to_it():
+    changes = ["matching.matcher=my-level", "matching.my_level.level_px=3"]
+    config = load_config(None, changes)
+    found = make_matcher("my-level", config.matching).match(shifted_pair(0))
+    assert np.nanmax(found.values) == 3
+    assert np.nanmedian(recon.match(image(), image(), matcher="my-level").values) == 7
+    assert np.nanmedian(recon.match(image(), image(), matcher="my-level", level_px=2).values) == 2
+    own = {"my_level": {"level_px": 3.0}}
+    assert config.recorded("pair")["matching"] == {"matcher": "my-level", **own}
+    assert load_config(config.model_dump(mode="json")) == config
+    assert load_config(config, {"matching.window_px": 9}).matching.my_level.level_px == 3
+    with pytest.raises(SettingsError, match=r"'matching\.my_level\.level_px': .*greater than"):
+        load_config(None, ["matching.my_level.level_px=-1"])
+    with pytest.raises(SettingsError, match=r"unknown setting 'matching\.my_level\.levels'"):
+        load_config(None, ["matching.my_level.levels=1"])
+    (group,) = list_settings("matching.my_level")
+    assert (group.name, group.purpose) == ("matching.my_level", "How a level is guessed.")
+    assert [one.default for one in group.settings] == ["7"]
+
+
+def test_settings_of_a_matcher_that_is_not_installed_are_refused_by_name():
+    with pytest.raises(SettingsError, match=r"unknown setting 'matching\.my_level'"):
+        load_config(None, ["matching.my_level.level_px=3"])
+
+
 NAMES = ("opencv-bm", "opencv-sgbm")
 BOTH = pytest.mark.parametrize("name", NAMES)
 
@@ -211,7 +269,8 @@ def shifted_pair(shift_px: int, shape: tuple[int, int] = (60, 160)) -> Rectified
 
 
 def match(name: str, pair: RectifiedPair, *, pad: bool = True, **settings: object) -> Disparity:
-    matcher = OpencvMatcher(OpencvSettings(pad=pad, **settings), semi_global=name == NAMES[1])
+    searched, opencv = SearchSettings.parse(settings), OpencvSettings(pad=pad)
+    matcher = OpencvMatcher(searched, opencv, semi_global=name == NAMES[1])
     return matcher.match(pair)
 
 
@@ -256,7 +315,7 @@ def test_what_opencv_could_not_match_is_nan_with_a_reason_and_tiny_images_no_err
 @pytest.mark.parametrize(
     ("name", "shape", "settings", "words"),
     [
-        ("opencv-bm", (6, 20), {"block_px": 21}, "20x6"),
+        ("opencv-bm", (6, 20), {"window_px": 21}, "20x6"),
         ("opencv-sgbm", (60, 160), {"min_disparity_px": -4096}, "exceed the range of OpenCV"),
         ("opencv-sgbm", (60, 160), {"ndisp": 4096}, "exceed the range of OpenCV"),
     ],

@@ -30,8 +30,7 @@ def scene(name: str) -> HardPair:
 
 @cache
 def matched(matcher: str, name: str) -> Disparity:
-    settings = MatchingSettings.parse({matcher: {"fill": True}})
-    return make_matcher(matcher, settings, 2).match(scene(name).pair)
+    return make_matcher(matcher, MatchingSettings(fill=True), 2).match(scene(name).pair)
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -10,13 +10,13 @@ import pytest
 from recon.core.errors import FormatError, MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedPair
 from recon.io.middlebury import stand_in_camera
+from recon.stereo.match import onnx as onnx_file
 from recon.stereo.match.network import match_in_tiles, rendered_pair
 from recon.stereo.match.onnx import PRESETS, OnnxMatcher, OnnxSettings, describe_network
+from tests.stereo.match.networks import Graph, write_matcher
 
 onnx = pytest.importorskip("onnx", reason="the package onnx builds the network: pip install onnx")
 pytest.importorskip("onnxruntime", reason="extra onnx: pip install 'recon-stereo[onnx]'")
-
-from tests.stereo.match.networks import Graph, write_matcher  # noqa: E402 (it needs onnx)
 
 
 def write_network(path, inputs, nodes, shape=(1, 1, None, None)):
@@ -62,7 +62,7 @@ def test_the_network_decides_the_disparity(difference):
     scaled = match(difference, pair_of(10, 15), mean=(0.2,), std=(0.5 / 255,), output_scale=-1.0)
     assert np.nanmedian(scaled.values) == pytest.approx(10, abs=1e-3)
     # 8 pixels of an image half as wide are 16 of the image.
-    half = match(difference, pair_of(18, 10), std=(1 / 255,), width_px=30, height_px=20)
+    half = match(difference, pair_of(18, 10), std=(1 / 255,), size_px=(30, 20))
     assert np.nanmedian(half.values) == pytest.approx(16)
 
 
@@ -113,7 +113,7 @@ def test_a_file_that_is_no_network_and_settings_that_disagree_are_refused(tmp_pa
     for name, words in (("bad.onnx", r"bad\.onnx"), ("none.onnx", "does not exist")):
         with pytest.raises(FormatError, match=words):
             match(tmp_path / name, pair_of(1, 2))
-    for values in ({"width_px": 8}, {"mean": (0.1, 0.2)}, {"std": (0.0,)}):
+    for values in ({"size_px": (8,)}, {"mean": (0.1, 0.2)}, {"std": (0.0,)}):
         with pytest.raises(SettingsError):
             OnnxSettings.parse(values)
     with pytest.raises(SettingsError, match=r"matching\.onnx\.model"):
@@ -238,12 +238,13 @@ def test_colours_reach_a_network_of_three_channels(tmp_path):
 
 
 @pytest.mark.parametrize("shape", [(448, 320), (128, 1024), (384, 512)])
-def test_tiles_give_what_the_whole_image_gives(matcher_file, shape):
+def test_tiles_give_what_the_whole_image_gives(matcher_file, shape, monkeypatch):
     random = np.random.default_rng(3)
     right = random.integers(0, 255, shape, dtype=np.uint8)
     pair = RectifiedPair(np.roll(right, 9, 1), right, stand_in_camera(*shape[::-1], ndisp=24))
     whole = run(matcher_file, pair, self_test=False, left_right=False)
-    tiled = run(matcher_file, pair, self_test=False, left_right=False, tile_megapixels=0.1)
+    monkeypatch.setattr(onnx_file, "_TILE_PX", 100_000)
+    tiled = run(matcher_file, pair, self_test=False, left_right=False)
     np.testing.assert_allclose(tiled.values, whole.values, atol=1e-4)
     assert np.nanmedian(tiled.values) == pytest.approx(9, abs=0.1)
 
@@ -317,10 +318,11 @@ def write_loop(path):
 
 
 @pytest.mark.parametrize("self_test", [True, False])
-def test_a_network_without_an_end_is_ended(tmp_path, self_test):
+def test_a_network_without_an_end_is_ended(tmp_path, self_test, monkeypatch):
+    monkeypatch.setattr(onnx_file, "_TIME_LIMIT_S", 0.3)
     path = write_loop(tmp_path / "loop.onnx")
-    with pytest.raises(MatchingError, match=r"does not come to an end.*0.3 s.*time_limit_s"):
-        match(path, pair_of(1, 2), self_test=self_test, time_limit_s=0.3)
+    with pytest.raises(MatchingError, match=r"does not come to an end.*0.3 s.*smaller images"):
+        match(path, pair_of(1, 2), self_test=self_test)
 
 
 def test_ctrl_c_ends_a_network(tmp_path):
