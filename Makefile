@@ -72,7 +72,7 @@ lint: $(READY) ## style, formatting, types and import contracts
 	$(BIN)/lint-imports
 
 docs: $(READY) ## the pages as a site, in build/site/index.html; links that lead nowhere are errors
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 interface: $(READY) ## write docs/commands.md, and the public names that the tests compare
 	@$(BIN)/python scripts/record_interface.py

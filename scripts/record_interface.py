@@ -110,7 +110,8 @@ def _row(parameter: Any, context: Any) -> str:
     if record is None:
         return ""
     names, text = (" ".join(part.split()).replace("|", "\\|") for part in record)
-    return f"| `{names}` | {text.replace('<', '&lt;')} |"
+    text = text.replace("<", "&lt;").replace("[", r"\[")  # neither HTML nor a link
+    return f"| `{names}` | {text} |"
 
 
 def main() -> None:
