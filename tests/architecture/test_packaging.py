@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from importlib.metadata import packages_distributions
 
 import pytest
+import yaml
 
 import recon
 from recon.commands.doctor import PACKAGES, SYSTEM_LIBRARIES
@@ -114,7 +115,10 @@ def test_kernels_need_no_linear_algebra_of_scipy(trees):
 def test_version_is_the_same_everywhere(root, pyproject):
     version = pyproject["project"]["version"]
     assert recon.__version__ == version
-    assert f"## [{version}]" in (root / "CHANGELOG.md").read_text()
+    cited = yaml.safe_load((root / "CITATION.cff").read_text())
+    heading = f"## [{version}] - {cited['date-released']}"
+    assert str(cited["version"]) == version
+    assert heading in (root / "CHANGELOG.md").read_text().splitlines()
 
 
 def test_what_messages_and_pages_tell_to_install_is_this_package(root, pyproject):
