@@ -93,7 +93,7 @@ def _section(command: Any, context: Any) -> str:
     rows = [_row(one, context) for one in command.get_params(context)]
     rows = [row for row in rows if row]
     if rows:
-        parts.append("\n".join(["| | |", "|---|---|", *rows]))
+        parts.append("\n".join(["| option | |", "|---|---|", *rows]))
     return "\n" + "\n\n".join(parts) + "\n"
 
 
