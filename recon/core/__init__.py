@@ -5,6 +5,7 @@
 - `kernels/compiled.py`: how loops are compiled; `kernels/cache.py`: where machine code is kept;
 - `kernels/voxels.py`: hashes and sets of packed cells;
 - `lazy.py`: libraries that are loaded when they are used;
+- `deprecated.py`: names that are replaced;
 - `plugins.py`: parts that others write, registered by packages or given as objects;
 - `text.py`: numbers read from text and written with words and units;
 - `progress.py`: who is told how far work is; `work.py`: threads, and seconds per stage;
