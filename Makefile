@@ -14,7 +14,8 @@ WORKERS ?= 2
 PYTEST := OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 \
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadscope --no-loadscope-reorder
 
-.PHONY: help setup demo test interpreted test-all fuzz check lint bench results lock format clean
+.PHONY: help setup demo test interpreted test-all test-other coverage fuzz check lint docs interface bench \
+	results lock format clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -48,6 +49,17 @@ interpreted: $(READY)
 test-all: $(COMPILED) ## every test
 	$(PYTEST)
 
+PYTHON ?= 3.13
+test-other: ## the tests marked portable, on another Python where there is one: PYTHON=3.12, or a path
+	@scripts/test_other.sh $(PYTHON)
+
+coverage: $(COMPILED) ## fast tests, and how much of each folder they run, kernels apart
+	$(PYTEST) -q -m "not slow" --cov --cov-report=
+	@$(BIN)/coverage report | awk ' \
+		/^recon/ {split($$1, part, "/"); folder = part[1] "/" part[2]; all[folder] += $$2; missed[folder] += $$3} \
+		/^TOTAL/ {all["total"] = $$2; missed["total"] = $$3} \
+		END {for (name in all) printf "%-24s %5d statements %4d %%\n", name, all[name], 100 - 100 * missed[name] / all[name]}' | sort
+
 fuzz: $(COMPILED) ## search at random for failing examples; MINUTES=30, SEED=… repeats a round
 	@scripts/fuzz.sh
 
@@ -58,6 +70,12 @@ lint: $(READY) ## style, formatting, types and import contracts
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(READY) ## the pages as a site, in build/site/index.html; links that lead nowhere are errors
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+interface: $(READY) ## write docs/commands.md, and the public names that the tests compare
+	@$(BIN)/python scripts/record_interface.py
 
 bench: $(COMPILED) ## speed of the matchers beside OpenCV's, as JSON; of drives beside the last tag, OTHER=…
 	@$(BIN)/python benchmarks/matching.py --json
@@ -74,5 +92,5 @@ format: $(READY) ## put the code into the project's style
 	$(BIN)/ruff format
 
 clean: ## remove .venv, caches and builds; outputs/ stays
-	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
+	rm -rf .venv .venv-3.* build dist .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -19,7 +19,7 @@ from typing import Any
 
 from recon.core.lazy import SHOWN_BY
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _NAMES = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
 _HOME_OF = {

@@ -6,6 +6,7 @@
 - `kernels/compiled.py`: how loops are compiled; `kernels/cache.py`: where machine code is kept;
 - `kernels/voxels.py`: hashes and sets of packed cells;
 - `lazy.py`: libraries, and what draws values, loaded when they are used;
+- `deprecated.py`: names that are replaced;
 - `plugins.py`: parts that others write, registered by packages or given as objects;
 - `text.py`: numbers read from text and written with words and units;
 - `summary.py`: what a command found, as a value, and how it becomes JSON;

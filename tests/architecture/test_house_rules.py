@@ -75,7 +75,9 @@ def test_no_file_names_a_path_of_one_machine(root):
     assert found == []
 
 
-@pytest.mark.parametrize("script", [".ci/run", "scripts/lock.sh", "scripts/setup.sh"])
+@pytest.mark.parametrize(
+    "script", [".ci/run", "scripts/lock.sh", "scripts/setup.sh", "scripts/test_other.sh"]
+)
 def test_script_can_be_executed(script, root):
     assert (root / script).stat().st_mode & 0o111
 

@@ -31,6 +31,8 @@ from recon.map.localize.sequence import StartPose
 from recon.map.sessions.measured import Survey
 from tests.docs.blocks import ROOT
 
+pytestmark = pytest.mark.portable
+
 SEEN: list[ReconConfig] = []
 probe = typer.Typer()
 

@@ -15,6 +15,8 @@ from recon.map.map import Map
 from recon.map.store.session import SessionInfo
 from recon.run.directory import STARTED, state_folder
 
+pytestmark = pytest.mark.portable
+
 
 @pytest.mark.parametrize(
     ("command", "defaults", "overrides"),

@@ -11,6 +11,8 @@ import pytest
 from recon.core import progress
 from recon.core.progress import Silent, series, showing, stage, tracked
 
+pytestmark = pytest.mark.portable
+
 
 class Noted(Silent):
     def __init__(self):

@@ -31,6 +31,8 @@ from recon.sources.times import read_dates, read_stamped_names
 from recon.street.settings import StreetScene
 from tests.scenery.bounds import numbers_of
 
+pytestmark = pytest.mark.portable
+
 FOREIGN = ["1_0", "١٢", "1_0.5", "\uff11\uff12"]
 PLY = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
 READERS: dict[str, tuple[Callable[[Path], object], str]] = {

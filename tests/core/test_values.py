@@ -24,6 +24,8 @@ from recon.core.values import (
 from recon.core.values.arrays import frozen_array
 from recon.core.values.board import CalibrationBoard, parse_board
 
+pytestmark = pytest.mark.portable
+
 NAN = float("nan")
 CAMERA = RectifiedCamera(700.0, 3.0, 2.0, 5.0, 0.5, 6, 4, ndisp=33)
 GREY = np.zeros((4, 6), np.uint8)

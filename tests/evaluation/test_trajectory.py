@@ -32,6 +32,8 @@ from recon.evaluation.trajectory import (
 )
 from recon.io.trajectory import write_tum
 
+pytestmark = pytest.mark.portable
+
 
 def trajectory(poses: np.ndarray) -> Trajectory:
     return Trajectory(poses, 0.1 * np.arange(len(poses), dtype=np.float64))

@@ -7,6 +7,8 @@ from recon.core.errors import FormatError, OutputError, SettingsError
 from recon.io import atomic
 from recon.io.atomic import atomic_path, check_targets, exchange, write_bytes, write_text
 
+pytestmark = pytest.mark.portable
+
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())

@@ -22,6 +22,8 @@ from recon.io.trajectory import (
 )
 from recon.sources.times import read_stamped_names
 
+pytestmark = pytest.mark.portable
+
 
 def test_tables_and_yaml_are_read_as_they_are_meant(tmp_path):
     path = tmp_path / "t.txt"

@@ -9,6 +9,8 @@ from recon.core.values import Trajectory
 from recon.evaluation.trajectory import associate, evaluate_trajectory
 from recon.io.trajectory import holds_times, read_trajectory, read_tum, write_tum
 
+pytestmark = pytest.mark.portable
+
 START_S = 1_700_000_000.0
 
 

@@ -23,6 +23,8 @@ from recon.stereo.frame import (
     voxel_downsample,
 )
 
+pytestmark = pytest.mark.portable
+
 SHAPE = (40, 64)
 CAMERA = RectifiedCamera(100.0, 30.5, 19.0, 34.5, 0.2, SHAPE[1], SHAPE[0])
 FB = CAMERA.focal_px * CAMERA.baseline_m

@@ -55,6 +55,13 @@ def test_the_page_may_speak_with_its_own_port_alone(standing):
     assert headers["Cache-Control"] == "no-store"
 
 
+def test_other_machines_cannot_connect(standing):
+    with socket.create_connection(("127.0.0.1", standing.port)) as own:
+        assert own.getpeername()[0] == "127.0.0.1"
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", standing.port), timeout=5)
+
+
 def test_by_its_other_name_a_page_speaks_with_that_name(standing):
     _, _, headers = ask(standing, standing.path, Host=f"localhost:{standing.port}")
     assert f"connect-src ws://localhost:{standing.port} " in headers["Content-Security-Policy"]

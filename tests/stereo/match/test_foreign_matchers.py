@@ -16,6 +16,8 @@ from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
 from recon.stereo.match.search import SearchSettings
 
+pytestmark = pytest.mark.portable
+
 
 def install_plugin(site, package, modules, points, group="matchers"):
     """Write modules and metadata of a package with entry points into a folder of packages."""
