@@ -1,10 +1,11 @@
 """How true the surface of a pair is: that of its pixels, and that of MeshLab's Poisson.
 
 Of every pixel with a known disparity, the ray is followed to the surface. ``covered`` is the share
-of the rays that meet it, ``within 1 px`` the fraction of all that meet it where it is, as a disparity;
-mean and 95 % are of those that meet it. ``on points`` is the fraction of the points that lie on it.
-Triangles within which the depth changes much are curtains between surfaces, or surfaces that are
-seen along themselves: ``over 10 %`` and ``over 20 %`` are their fractions of the area.
+of the rays that meet it, ``within 1 px`` the fraction of all that meet it where it is, as a
+disparity; mean and 95 % are of those that meet it. ``on points`` is the fraction of the points
+that lie on it. Triangles within which the depth changes much are curtains between surfaces, or
+surfaces that are seen along themselves: ``over 10 %`` and ``over 20 %`` are their fractions of the
+area.
 
 Of a drive, the first pair is taken; without a truth, there are fewer figures.
 

@@ -47,7 +47,8 @@ PLACES: Final = {
     "corner": (1.0, 1.0), "left": (0.5, 0.07), "right": (0.5, 1.0), "top": (0.0, 0.5),
     "centre": (0.5, 0.5),
 }  # fmt: skip
-"""Where disparities are judged, as fractions of height and width; the right image sees all of it."""
+"""Where disparities are judged, as fractions of height and width; the right image sees all of
+it."""
 
 
 class Noisy(StereoSource):

@@ -23,7 +23,7 @@ def export(
         list[str] | None,
         opt.option(
             "cloud, grid, octomap, mesh; costmap (Nav2); for surveying programs las, laz, "
-            "copc, e57, and dsm, dtm, slope, orthophoto, occupancy (GeoTIFF); pcd (PCL), npz "
+            "copc, e57, and dsm, dtm, slope, orthophoto, grid-geotiff (GeoTIFF); pcd (PCL), npz "
             "(NumPy), mcap, gridmap (ROS 2), colmap, nerfstudio, texture; several with commas.",
             default="the first four",
         ),

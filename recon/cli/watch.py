@@ -25,7 +25,7 @@ def show_batch(folder: Path) -> None:
     _refresh(rounds) if sys.stdout.isatty() else _list_changes(rounds)
     if not is_done(folder):
         hint = f"recon batch --resume {folder} does what is missing"
-        typer.echo(f"warning: nobody runs this batch; {hint}", err=True)
+        typer.echo(f"warning: no process runs this batch; {hint}", err=True)
 
 
 def _refresh(rounds: Iterator[list[JobResult]]) -> None:

@@ -180,7 +180,7 @@ class Reliability(NamedTuple):
 
 
 class Sparsification(NamedTuple):
-    """Sparsification curve: fraction of wrong pixels left as the least confident ones are removed."""
+    """Sparsification curve: wrong pixels that are left as the least confident are removed."""
 
     removed: Float64  # (N,), fraction of removed pixels, from 0 to below 1
     wrong: Float64  # (N,), fraction of wrong pixels among the rest, if removed by confidence
@@ -228,7 +228,7 @@ def measure_sparsification(
 
 
 def ratio_within_sigma(estimate: Disparity, truth: DisparityTruth, sigmas: float = 1.0) -> float:
-    """Return the fraction of the pixels, in [0, 1], whose error is within some standard deviations."""
+    """Return the fraction of pixels, in [0, 1], whose error is within some standard deviations."""
     both, error_px = _pixels(estimate, truth)
     return float(np.mean(error_px < sigmas * estimate.sigma_px[both]))
 

@@ -325,7 +325,7 @@ def _printed_pair(experiment: Experiment) -> RectifiedPair:
 
 
 def _patch_figures(patch_px: int, found: Disparity, truth: DisparityTruth | None) -> PatchFigures:
-    """Return the fractions of pixels with a value, wrong and right, and the mean error in pixels."""
+    """Return fractions of pixels with a value, wrong and right, and the mean error in pixels."""
     bad = right = error = None
     if truth is not None:
         metrics = evaluate_disparity(found, truth, (BAD_PX,))

@@ -94,12 +94,12 @@ def even_sample(tiles: Tiles) -> PointCloud:
 def _doubts(tiles: Tiles, points: int, removed: int) -> list[str]:
     """Return a warning where much was left out, or nothing could be."""
     if tiles.config.fusion.remove_moving and tiles.observations is None:
-        what = "no rays were kept, so what moved stays in the cloud"
+        what = "no rays were kept, so dynamic objects stay in the cloud"
         return [f"{what}; map with --set occupancy.keep_rays=true to leave it out"]
     ratio = removed / max(points + removed, 1)
     if ratio <= _MUCH:
         return []
-    what = f"{100 * ratio:.1f} % of the points are taken for what moved and left out"
+    what = f"{100 * ratio:.1f} % of the points are taken for dynamic objects and left out"
     return [f"{what}: look at map/removed.ply; --set fusion.remove_moving=false keeps them"]
 
 

@@ -18,16 +18,13 @@ from recon.core.values.camera import depth_from_disparity, project
 from recon.core.values.cloud import Frame
 from recon.core.values.image import in_colour
 from recon.export.mesh.grid import mesh_grid
-from recon.export.mesh.pieces import WHOLE
+from recon.export.mesh.pieces import WHOLE, MeshFigures
 from recon.export.mesh.poisson import MeshSettings, reconstruct_mesh
 from recon.io.images.disparity import fitting_scale, write_disparity_png, write_pfm
 from recon.io.images.image import read_image, write_image
 from recon.io.models.mesh import Photo, write_mesh, write_mlp
 from recon.io.models.ply import write_ply
 from recon.stereo.frame import ReconstructedFrame
-
-pass
-from recon.export.mesh.pieces import MeshFigures
 
 PAIR_CLOUD: Final = "clouds/cloud.ply"
 _PHOTO: Final = "left.png"  # the left image, beside the mesh

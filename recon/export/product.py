@@ -28,8 +28,6 @@ from recon.sources.synthetic import SyntheticSource
 from recon.stereo.rectify.rectifier import Rectifier, turns_of
 from recon.street.settings import StreetSettings
 
-pass
-
 
 @dataclass(frozen=True, eq=False)
 class ExportContext:

@@ -81,7 +81,7 @@ def _receive(address: str, part: Path, size: int | None, on_bytes: OnBytes) -> N
             raise DownloadError(what, where=address, got=got, expected=counted(size, "byte"))
         free, needed = shutil.disk_usage(part.parent).free, (total or 0) - begin
         if needed > free:
-            what = "there is no room for the download"
+            what = "not enough disk space for the download"
             got, expected = f"{free / 1e9:.1f} GB free", f"{needed / 1e9:.1f} GB"
             raise OutputError(what, where=part.parent, got=got, expected=expected)
         if begin == 0:

@@ -349,7 +349,7 @@ class _Shared(NamedTuple):
 
 
 def _of_rows(places: Places) -> tuple[Float64, Float64]:
-    """Return normal equations of the epipolar errors (W, N), which neither pose nor depth changes."""
+    """Return normal equations of epipolar errors (W, N), which neither pose nor depth changes."""
     error = places.right_uv[..., 1] - places.left_uv[..., 1]
     residual = np.nan_to_num(error) / _ROW_SIGMA_PX
     weight = np.isfinite(error) / (1.0 + (residual / CAUCHY_SIGMAS) ** 2)

@@ -90,7 +90,7 @@ def _best_offset(
 
 
 def _best_moving(by_offset: _ByOffset, best: int, camera: RectifiedCamera) -> int:
-    """Return of the offsets that fit about as well as the best one that at which moving rows do best.
+    """Return, of offsets that fit about as well as the best, that where moving rows fit best.
 
     Where little moves, or what is ahead comes nearer, neighbouring frames match as well.
     """
@@ -105,8 +105,8 @@ def _best_moving(by_offset: _ByOffset, best: int, camera: RectifiedCamera) -> in
 
 
 def _best_fit(by_offset: _ByOffset) -> tuple[int, float]:
-    """Return the offset that fits best, and how many times as well as none; 1 if few features do."""
-    # Lags were tried on different numbers of pairs.
+    """Return the offset that fits best, and how many times as well as none; 1 if few do."""
+    # Offsets were tried on different numbers of pairs.
     total = {offset: sum(n.agreeing for n in at) for offset, at in by_offset.items()}
     fit = {offset: number / len(by_offset[offset]) for offset, number in total.items()}
     best = max(fit, key=lambda offset: (fit[offset], -abs(offset)), default=0)

@@ -47,8 +47,8 @@ MOST_TIME_OFFSET: Final = 0.1  # frames from which right images are said to be l
 LATER: Final = "after the left ones"  # in what is said of them
 MOVES: Final = (
     "what is wrong with the rig moves with what is seen instead of staying in the image, as in "
-    "stabilised images: no calibration repairs that, so at most rows are aligned, and depth and the "
-    "length of the path stay off; record images as sensors see them"
+    "stabilised images: no calibration repairs that, so at most rows are aligned, and depth and "
+    "the length of the path stay off; record images as sensors see them"
 )
 
 
@@ -297,7 +297,7 @@ class RefinedRig:
 
     def warnings(self, known: Sequence[str] = ()) -> list[str]:
         """Return what the user should know of a rig, and does not from lines that are ``known``."""
-        late = f"right images are taken {self.late} {LATER}: what moves is seen at a wrong depth, "
+        late = f"right images are taken {self.late} {LATER}: moving objects get a wrong depth, "
         late += "which no calibration repairs; trigger both cameras together"
         lines = [late] if self.late and not any(LATER in line for line in known) else []
         if self.fitted is not None and not self.fitted.fixed:

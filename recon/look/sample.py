@@ -147,8 +147,8 @@ def measure_time_skew(
 ) -> tuple[float, float] | None:
     """Return the delay of the right camera in frames, and its standard error; None if unknown.
 
-    It is the slope of the epipolar error (right minus left, (N,)) over the rows that features move by in
-    a frame, as a late camera sees them moved on.
+    It is the slope of the epipolar error (right minus left, (N,)) over the rows that features move
+    by in a frame, as a late camera sees them moved on.
     """
     moving = np.abs(row_flow_px) > _MIN_FLOW_PX
     if moving.sum() < _MIN_POINTS:

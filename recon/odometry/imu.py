@@ -24,8 +24,6 @@ from recon.odometry.visual import VisualOdometry
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
 
-pass
-
 _MOST_STEPS: Final = 5.0  # usual steps between two samples; over a longer gap nothing is known
 
 

@@ -46,7 +46,7 @@ def make_odometry(
     without a prior ``guide`` says how the rig moves: neither is of use to one that is not ours.
     """
     if odometry == "sfm":
-        what, expected = "structure from motion is no odometry frame by frame", "visual or kiss"
+        what, expected = "structure from motion does not run frame by frame", "visual or kiss"
         raise SettingsError(what, where="odometry.method", got=odometry, expected=expected)
     check_odometry(odometry)
     if not isinstance(odometry, str) or odometry not in ODOMETRIES:
@@ -125,7 +125,7 @@ class ForeignOdometry:
         try:
             health = _HEALTH.validate_python(vars(found.health))
         except (ValidationError, TypeError) as error:
-            what, got = "the health of a pose is none", repr(found.health)
+            what, got = "odometry returned an invalid OdometryHealth", repr(found.health)
             raise RegistrationError(what, where=where, got=got) from error
         self._begun = True
         return OdometryResult(T, health)

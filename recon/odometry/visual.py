@@ -266,7 +266,7 @@ class VisualOdometry:
         why = f"{what if sees else _NOTHING} ({counted(points, 'feature')})"
         step_m = float(np.linalg.norm(motion.T_before_camera[:3, 3]))
         if guided is None or (guided.holds and guided.sigma_m > most_sigma_m(step_m, guided.scale)):
-            notes = (f"lost: {why}; {'the path begins anew' if sees else 'skipped'}",)
+            notes = (f"lost: {why}; {'a new segment begins' if sees else 'skipped'}",)
             health = OdometryHealth(ok=sees, skipped=not sees, begins=sees, notes=notes)
             return VisualEstimate(OdometryResult(motion.T_world_camera, health), None)
         note = f"carried by {guided.name}: {why}"

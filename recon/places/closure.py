@@ -39,8 +39,8 @@ _MAX_DEFORMATION_CHI2: Final = (
     6.0  # mean chi-square of the odometry edges above which no loop is believed
 )
 USUAL: Final = 0.3
-"""What odometry usually drifts, as a fraction of what it may: measured positions, whose errors do not
-grow, would make a path as rough as they are if it counted for less."""
+"""What odometry usually drifts, as a fraction of what it may: measured positions, whose errors do
+not grow, would make a path as rough as they are if it counted for less."""
 
 _HELD_ROUNDS: Final = 2
 """Solutions of a graph with measured positions; the second knows how antennas are turned."""
@@ -137,13 +137,14 @@ def _believed(loops: Sequence[Loop], kept: Bool, segment: NDArray[np.int64]) -> 
 def join_drives(
     drives: Sequence[DrivePath], constraints: Sequence[Constraint], held: Held | None = None
 ) -> JoinedDrives | None:
-    """Correct the paths of drives so that their constraints hold; None = the constraints are not believed.
+    """Correct the paths of drives so that their constraints hold; None = these are not believed.
 
     Fixed is the first pose of the longest segment of the first drive. Nodes are spaced along the
     paths; odometry edges link each to the next of its segment, constraints link distant ones. The
-    optimiser may switch constraints off. It starts with a tolerance that admits every constraint and tightens it
-    step by step, so that a right one is not refused because of the very drift that it corrects. If
-    the constraints deform the odometry of a drive more than its drift explains, none is believed.
+    optimiser may switch constraints off. It starts with a tolerance that admits every constraint
+    and tightens it step by step, so that a right one is not refused because of the very drift that
+    it corrects. If they deform the odometry of a drive more than its drift explains, none is
+    believed.
 
     Ref: Yang et al., "Graduated non-convexity for robust spatial perception", RA-L 2020.
     """
@@ -211,7 +212,7 @@ def longest_segment(segment: NDArray[np.int64]) -> int:
 def _spaced(
     drives: Sequence[DrivePath], constraints: Sequence[Constraint]
 ) -> list[NDArray[np.intp]]:
-    """Return the frames of each drive that are nodes: at even distances, and where constraints are."""
+    """Return the frames of each drive that are nodes: evenly spaced, and those constrained."""
     ends: list[set[int]] = [set() for _ in drives]
     for constraint in constraints:
         ends[constraint.drives[0]].add(constraint.loop.first)
@@ -227,7 +228,7 @@ def _spaced(
 
 
 def nodes_along(drive: DrivePath, gap_m: float, constrained: Sequence[int]) -> NDArray[np.intp]:
-    """Return frames at even distances along each segment, its first and last, and those constrained."""
+    """Return evenly spaced frames of each segment, its first and last, and those constrained."""
     nodes = [np.array(constrained, np.intp)]
     if drive.segment.max() < 0:
         return np.zeros(1, np.intp)
@@ -286,7 +287,7 @@ def _solve(
 def odometry_edges(
     drive: DrivePath, nodes: NDArray[np.intp], begin: int, ratio: float
 ) -> list[PoseEdge]:
-    """The edges along a drive, with a fraction of the drift that is possible, and all that is stated.
+    """The edges along a drive, with a fraction of the possible drift, and all that is stated.
 
     Nodes are numbered from ``begin``.
     """

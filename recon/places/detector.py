@@ -33,8 +33,8 @@ from recon.places.verify import Verdict, verify
 CONTRADICTED: Final = "odometry contradicts"
 """Why a loop is refused that differs from odometry by more than its drift explains."""
 _SEEN_RATIO: Final = 0.75
-"""Fraction of what either of a view and the last keyframe shows, and the other can see, from which on
-the view is no new one."""
+"""Fraction of what either of a view and the last keyframe shows, and the other can see, from which
+on the view is no new one."""
 
 _HERE: Final = (3, 3)
 """Loops of a keyframe that are enough, and how many more candidates may fail, where it is compared

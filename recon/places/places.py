@@ -262,7 +262,7 @@ class PathFit:
             return
         least, most = max(0.0, 1.0 - self.most_scaling), 1.0 + self.most_scaling
         raise EvaluationError(
-            "neither drift nor noise explains how far positions and path are apart",
+            "positions and trajectory differ by more than drift and noise explain",
             where=where,
             got=f"{self.rms_m:.3g} m (RMS), {self.scale:.3g} times as far from one another",
             expected=f"at most {self.most_m:.3g} m, {least:.2f} to {most:.2f} times",

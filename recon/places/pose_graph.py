@@ -49,7 +49,8 @@ from recon.core.values.arrays import Bool, Float64, Int32, freeze, frozen_array
 _ROUNDS: Final = 30
 _STILL: Final = 1e-6  # gain of a step, as a fraction of the cost, that is not worth another one
 _DAMPING: Final = 1e-9
-"""The first, of the diagonal: far below the ratio by which a chain of thousands resists deformation."""
+"""The first, of the diagonal: far below the ratio by which a chain of thousands resists
+deformation."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,7 +94,7 @@ def write_middlebury_page(summary: Mapping[str, Any], run: RunDirectory) -> None
 
 @style.styled
 def reliability_figure(matchers: Mapping[str, Figures]) -> bytes:
-    """Draw the fraction of correct pixels by confidence; below, the fraction of pixels in each bin."""
+    """Draw how many pixels are correct by confidence; below, how many are in each bin."""
     ratios: dict[str, Any] = {"sharex": True, "height_ratios": (4, 1)}
     figure, (upper, lower) = style.subplots(style.HALF_IN, 5.0, 2, **ratios)
     upper.plot((0, 1), (0, 1), color=style.FAINT, linestyle="--", linewidth=1, label="calibrated")

@@ -42,8 +42,8 @@ _RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth
 # the frame reports others.
 _BY_IMAGES: Final = frozenset({"black", "gain", "blur", "features"})
 _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
-# Fraction of pixels with a measured disparity below which a pair is warned of: real ones, even of bare
-# walls, exceed 40 %. It is also warned of where more was inferred than measured.
+# Fraction of pixels with a measured disparity below which a pair is warned of: real ones, even of
+# bare walls, exceed 40 %. It is also warned of where more was inferred than measured.
 _FEW_MEASURED_RATIO: Final = 0.25
 # Findings with which rows and motion say nothing about the calibration.
 _NOT_OF_THE_RIG: Final = frozenset(

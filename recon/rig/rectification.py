@@ -74,7 +74,8 @@ class RectifySummary(RunSummary):
         out, plan = self.out or "", self.plan
         error = "not known: no features"
         if self.epipolar_error_px is not None:
-            error = f"error of {self.epipolar_error_px:.2f} px, 95 % below {self.epipolar_error_95_px:.2f} px"
+            error = f"error of {self.epipolar_error_px:.2f} px"
+            error += f", 95 % below {self.epipolar_error_95_px:.2f} px"
         if isinstance(plan, ByCalibration):
             scale, use = f"baseline {metres(plan.baseline_m)}", f"recon map {shown_path(out)}"
         else:

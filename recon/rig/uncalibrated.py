@@ -184,7 +184,7 @@ def _fit(features: PairFeatures, size: Size, min_features: int) -> Homographies:
 
 
 def _epipolar_errors(H: Homographies, features: PairFeatures) -> Float64:
-    """Return float64 (N,), absolute epipolar errors of matches; those of false matches are limited."""
+    """Return float64 (N,), absolute epipolar errors of matches, limited for false ones."""
     left, right = map_pixels(H[0], features.left_uv), map_pixels(H[1], features.right_uv)
     return np.minimum(np.abs(left[:, 1] - right[:, 1]), 4 * _INLIER_PX)
 

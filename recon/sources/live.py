@@ -92,10 +92,10 @@ class LiveSource(DerivedSource):
     def warnings(self) -> list[str]:
         lines = []
         if self._unmatched:
-            what = "only tracked, not matched: the map lacks what they saw"
-            lines.append(f"{counted(self._unmatched, 'frame')} came too fast, {what}")
+            what = "tracked but not matched, so their points are not in the map"
+            lines.append(f"{counted(self._unmatched, 'frame')} arrived too fast, {what}")
         if self.dropped:
-            lines.append(f"{counted(self.dropped, 'frame')} came too fast, dropped")
+            lines.append(f"{counted(self.dropped, 'frame')} arrived too fast, dropped")
         return lines
 
     def _play(self, start: int) -> None:

@@ -25,8 +25,6 @@ import numpy as np
 from recon.core.errors import OutputError, require
 from recon.core.machine import return_free_memory
 
-pass
-
 HOST: Final = "127.0.0.1"  # whoever looks is on this machine
 MOST_PAGES: Final = 8  # that look at a time: each takes a copy of what is shown
 _PART_BYTES: Final = 1 << 18  # of a message, that wait for a page to take them

@@ -149,8 +149,8 @@ AUDITED = AuditSummary(
         source="06", description="KITTI", frames=1101, frames_left_out=0, frames_read=72,
         repeated_frames=3, frozen_left_frames=0, frozen_right_frames=0, gaps=1, longest_step_s=0.2,
         usual_step_s=0.1, gain=1.0, sharpness_left=0.5, sharpness_right=0.5, features=1000,
-        swapped_ratio=0.0, time_offset_frames=0, time_skew_frames=0.0, baseline_m=0.537, focal_px=707.0,
-        field_of_view_deg=80.0, speed_m_per_s=10.0, epipolar_error_rms_px=0.23,
+        swapped_ratio=0.0, time_offset_frames=0, time_skew_frames=0.0, baseline_m=0.537,
+        focal_px=707.0, field_of_view_deg=80.0, speed_m_per_s=10.0, epipolar_error_rms_px=0.23,
         depth_error_m={"10": 0.045},
     ),
     repaired=CorrectedFigures(
@@ -224,7 +224,9 @@ SUMMARIES: dict[str, Summary] = {
     "calibrate": CALIBRATED,
     "calibrate again": replace(CALIBRATED, verdict="repeat", files=None),
     "rectify": RECTIFIED,
-    "rectify without features": replace(RECTIFIED, epipolar_error_px=None, epipolar_error_95_px=None),
+    "rectify without features": replace(
+        RECTIFIED, epipolar_error_px=None, epipolar_error_95_px=None
+    ),
     "capture": CAPTURED,
     "board": BoardSummary(
         board="chess:9x6:25mm", square_mm=25.0, pattern_width_mm=250.0, pattern_height_mm=175.0,

@@ -196,7 +196,8 @@ def test_a_sample_is_small_and_even_and_all_of_a_small_cloud():
     kept = sample.cloud()
     assert 1000 < len(kept) <= 2000
     octants = np.bincount((kept.xyz > 0) @ [1, 2, 4], minlength=8)
-    # As many in each eighth of the cube as chance allows: 3 standard deviations of a fraction of 1/8.
+    # As many in each eighth of the cube as chance allows: 3 standard deviations of a fraction of
+    # 1/8.
     assert np.abs(octants / len(kept) - 1 / 8).max() < 3 * np.sqrt(7 / 64 / len(kept))
 
 

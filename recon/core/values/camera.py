@@ -54,7 +54,7 @@ class CameraIntrinsics:
         (fx, skew, cx), (zero, fy, cy), last = self.matrix.tolist()
         _check_view((fx, fy), (cx, cy), (self.width_px, self.height_px))
         if abs(skew) > fx or zero != 0 or last != [0, 0, 1]:
-            raise CalibrationError("camera matrix is none of a lens", got=self.matrix.tolist())
+            raise CalibrationError("camera matrix is not that of a lens", got=self.matrix.tolist())
         if np.abs(self.distortion).max(initial=0.0) > _MOST_DISTORTION:
             raise CalibrationError("distortion is implausible", got=self.distortion.tolist())
         if self.model == "fisheye" and self.distortion.size != 4:

@@ -59,7 +59,7 @@ class DisparityTruth:
             shown = mask if mask.dtype == np.bool_ else mask == _SEEN_BY_BOTH
             if mask.shape != found.shape or (mask.dtype != np.bool_ and not shown.any()):
                 raise ShapeError(
-                    "nonocc is no mask of the truth",
+                    "nonocc is not a mask of the ground truth",
                     got=f"{mask.dtype} {mask.shape}",
                     expected=f"bool {found.shape}, or levels, {_SEEN_BY_BOTH} where both see",
                 )

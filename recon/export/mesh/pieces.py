@@ -38,7 +38,7 @@ from recon.export.mesh.poisson import (
     reconstruct_map_surface,
     reconstruct_mesh,
 )
-from recon.export.product import ExportContext, ExportResult
+from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.io.atomic import write_text
 from recon.io.models.las import check_crs
 from recon.io.models.mesh import join_meshes, read_mesh, write_mesh, write_mlp
@@ -46,9 +46,6 @@ from recon.map.cut import Rectangle
 from recon.map.occupancy.moving import looked_through
 from recon.map.sessions.placed import has_occupancy
 from recon.map.tiles import Tiles
-
-pass
-from recon.export.product import ProductFigures
 
 WHOLE: Final = "mesh/mesh.ply"
 LAYER: Final = "mesh/cloud.ply"  # of the MeshLab project, where there is no other cloud

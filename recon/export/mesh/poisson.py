@@ -219,8 +219,8 @@ def _spacing(some_xyz: Float32, xyz: Float32) -> Float32:
 
 
 _OF_SEVENTH: Final = math.sqrt(math.pi / 7)
-"""Edge of the square that a point has for itself, as a fraction of the way to its seventh neighbour:
-a circle that wide holds seven."""
+"""Edge of the square that a point has for itself, as a fraction of the way to its seventh
+neighbour: a circle that wide holds seven."""
 
 
 def reconstruct_map_surface(

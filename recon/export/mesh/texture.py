@@ -35,14 +35,11 @@ from recon.core.values.camera import project
 from recon.core.values.image import in_colour
 from recon.export.mesh.charts import MARGIN_PX, Atlas, make_atlas, ratios_of, texels_of
 from recon.export.mesh.pieces import SAMPLE_FACES, WHOLE, mesh_product, write_surveyed
-from recon.export.product import DriveImages, ExportContext, ExportResult
+from recon.export.product import DriveImages, ExportContext, ExportResult, ProductFigures
 from recon.io.images.image import write_image
 from recon.io.models.mesh import Photo, read_mesh, write_mesh, write_mlp
 from recon.map.fusion import fusion_range_m
 from recon.map.sessions.placed import settings_of
-
-pass
-from recon.export.product import ProductFigures
 
 _WITH_TEXTURE: Final = ("glb", "obj", "ply")
 _VIEWS: Final = 3  # images that a vertex takes its colour from

@@ -97,7 +97,7 @@ def check_crs(crs: str, where: StrPath = "--crs") -> Any:
     got = f"{crs} ({found.name})"
     units = {axis.unit_name for axis in found.axis_info}
     if not found.is_projected or units != {"metre"}:
-        what = "the coordinates of this system are not metres to the east and north"
+        what = "the coordinate system has no easting and northing in metres"
         got = f"{crs} ({found.name}; {', '.join(sorted(units))})"
         raise SettingsError(what, where=where, got=got, expected=expected)
     try:
@@ -140,7 +140,7 @@ def _check_metres(system: Any, lons: Float64, lats: Float64, where: StrPath) -> 
     _, _, apart_m = system.get_geod().inv(lons[[0, 0]], lats[[0, 0]], lons[1:], lats[1:])
     if on_earth and (np.abs(np.log(apart_m)) < np.log(_LARGEST_STRETCH)).all():
         return
-    what = "a metre of the coordinate system is not one on the ground where the positions are"
+    what = "the coordinate system distorts lengths where the positions are"
     got = f"longitude {lons[0]:g}, latitude {lats[0]:g} in {system.srs}"
     expected = "a projected system, such as EPSG:25832"
     raise EvaluationError(what, where=where, got=got, expected=expected)

@@ -89,17 +89,15 @@ class DriveLoops:
         """Return warnings about loops that were not closed."""
         closed, refused = len(self.closure.closed), len(self.closure.refused)
         if refused and not closed:
-            what = "odometry contradicts, or too few agree; the map may show a place twice"
+            what = "they contradict odometry, or too few agree; the map may show a place twice"
             return [f"{counted(refused, 'loop')} found and none closed: {what}"]
         if refused:
             loops = counted(refused + closed, "loop")
             return [f"{refused} of {loops} contradict the others; they are left"]
         elsewhere = self.refused.get(CONTRADICTED, 0)
         if elsewhere >= _TELLING and not closed:
-            why = "streets look alike, or the odometry is far off"
-            return [
-                f"{counted(elsewhere, 'place')} recognised where the drive cannot have been: {why}"
-            ]
+            where = f"{counted(elsewhere, 'place')} recognised outside the bounds of odometry drift"
+            return [f"{where}: perceptual aliasing, or odometry is far off"]
         return []
 
 

@@ -2,9 +2,9 @@
 
 The evidence of one frame is collected first, so that a thousand rays through a cell count once and
 a hit outweighs every miss; then `recon.map.kernels.clamped` adds the frame to the log-odds. A
-measurement is a normal distribution along its ray: a cell is hit by the fraction of the distribution
-that lies in it, and only what lies well before it is free. All lengths are in cells, except those
-of the points given. Reference implementations: `tests/map/kernels/reference.py`.
+measurement is a normal distribution along its ray: a cell is hit by the fraction of the
+distribution that lies in it, and only what lies well before it is free. All lengths are in cells,
+except those of the points given. Reference implementations: `tests/map/kernels/reference.py`.
 
 Ref: J. Amanatides and A. Woo, "A fast voxel traversal algorithm for ray tracing", Eurographics
 1987; A. Hornung et al., "OctoMap: an efficient probabilistic 3D mapping framework based on

@@ -128,7 +128,9 @@ class Localizer:
         self._frames += 1
         sure_m = self._known.scale * _SURE_SIGMA_M
         if self._belief is not None and self._belief.sigma_m <= sure_m and hurried():
-            return self._result(_Confirmed(self._belief, refused="no time to look at the map"))
+            return self._result(
+                _Confirmed(self._belief, refused="no time left to match against the map")
+            )
         keyframe = make_keyframe(self._frames - 1, frame.pair, frame.disparity)
         lost = None
         if self._belief is not None:
@@ -211,7 +213,7 @@ class Localizer:
         why = "" if seen else confirmed.refused or "no view of the map is near"
         if not belief.certain:
             self._belief = None
-            return Located(State.LOST, note=why or "what confirms the pose is too uncertain")
+            return Located(State.LOST, note=why or "the covariance of the pose is too large")
         self._belief = belief
         return Located(
             State.TRACKING if seen else State.COASTING,

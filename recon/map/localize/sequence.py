@@ -167,11 +167,11 @@ class LocalizedDrive:
         if not self.tracked:
             return ["the drive was not found in the map: no frame has a pose"]
         times = "once" if lost == 1 else f"{lost} times"
-        of = f"{coasting} of {counted(len(states), 'pose')} are by odometry alone"
-        lines = [f"{of}: nothing in the map confirms them (coasting)"] if coasting else []
+        of = f"{coasting} of {counted(len(states), 'pose')} rest on odometry alone"
+        lines = [f"{of}: they are not confirmed by the map (coasting)"] if coasting else []
         if lost:
             lines += [
-                f"the drive was lost {times}; frames without a pose are not in the trajectory"
+                f"localization was lost {times}; frames without a pose are not in the trajectory"
             ]
         return lines
 

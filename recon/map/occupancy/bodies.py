@@ -57,8 +57,9 @@ def dynamic_cells(keys: Int64, placed: Bool, observations: Iterable[Int8]) -> Bo
     """Return bool (N,), the cells of pieces of surface that were there at one time only.
 
     ``keys`` are sorted packed cells with points that were seen through as often as hit; ``placed``
-    those with points that their frames could place in one cell, the better evidence; ``observations`` what
-    each frame saw in the cells, int8 (N,): 1 hit, -1 looked through, 0 neither.
+    those with points that their frames could place in one cell, the better evidence;
+    ``observations`` what each frame saw in the cells, int8 (N,): 1 hit, -1 looked through, 0
+    neither.
     """
     pairs, upright = pairs_of(keys)
     of_cells, before = np.zeros((3, len(keys)), np.int64), np.zeros(len(keys), np.int8)

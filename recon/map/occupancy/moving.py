@@ -59,7 +59,8 @@ _PLACED: Final = 0.45
 _UNSURE: Final = _MOST / 2
 """Largest mean evidence around a voxel that may be of what moved beside it."""
 _MUCH: Final = 0.02
-"""Fraction of the points of a tile from which error is likelier to be underrated than all to move."""
+"""Fraction of the points of a tile from which error is likelier to be underrated than all to
+move."""
 _SIGMAS: Final = (FREE_MARGIN_SIGMAS, 2 * FREE_MARGIN_SIGMAS)
 """Standard deviations that a body must have moved by; the second where so much would go."""
 _INSIDE: Final = 8  # voxels that touch one inside a surface
@@ -98,7 +99,8 @@ def find_moved(
 
     ``sigma_m`` (N,) is the standard deviation of each in a frame; ``counted`` (N,) are those that
     enough frames saw, the voxels of others do not count. ``evidence`` is of the same drive;
-    ``voxels`` and ``observations`` are what all drives and their frames observed. All is in map axes.
+    ``voxels`` and ``observations`` are what all drives and their frames observed. All is in map
+    axes.
     """
     places = points / voxels.resolution_m
     packed = pack_keys(np.floor(places).astype(np.int64))

@@ -137,8 +137,8 @@ def doubts_of_lengths(map_: MapFile) -> list[str]:
         longer = times_as_long(*paths, [link.loop for link in links])
         if longer is not None and abs(longer[0] - 1.0) > max(_LARGEST, _SIGMAS * longer[1]):
             lines.append(
-                f"between the places that both saw, session {one} is {longer[0]:.3f} times as long "
-                f"as session {other}: the baseline of one rig is off, or a drive has drifted"
+                f"between places that both observed, session {one} is {longer[0]:.3f} times as "
+                f"long as session {other}: the baseline of one rig is off, or a drive has drifted"
             )
     return lines
 

@@ -25,8 +25,6 @@ from recon.core.text import counted, metres
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.io.positions import ControlPoints, Positions, is_control, read_control
-
-pass
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
 from recon.odometry.health import expected_drift
@@ -349,7 +347,7 @@ def misfit_rms_m(map_: MapFile) -> float | None:
 
 
 def doubts_of_positions(map_: MapFile) -> list[str]:
-    """Return a warning if paths that are constrained by measured positions are far from them still."""
+    """Return a warning if paths constrained by measured positions are still far from them."""
     off_m = misfit_rms_m(map_)
     extent_m = max((span_m(each.trajectory.positions_m) for each in map_.linked), default=0.0)
     if off_m is None or off_m <= LARGEST_MISFIT * extent_m:

@@ -186,7 +186,7 @@ class MapFile:
             apart = np.flatnonzero(session.trusted & ~placed[session.number]).tolist()
             if apart:
                 lie = "lies" if len(apart) == 1 else "lie"
-                why = f"{lie} beyond a break, and nothing that was seen again says where"
+                why = f"{lie} beyond a break, and no loop closure connects them"
                 left_out = "not in cloud, grid, OctoMap and mesh, nor to be recognised"
                 lines.append(f"{of}{name_frames(apart)} {why}: {left_out}")
         return lines

@@ -49,7 +49,7 @@ def writing(path: Path | None) -> Iterator[None]:
     except sqlite3.Error as error:
         text = str(error)
         if "locked" in text:
-            what, hint = "another program uses the map", "wait for it, or write to another one"
+            what, hint = "another process uses the map", "wait for it, or write to another one"
         elif "readonly" in text:
             what = "the map can only be read"
             hint = "make the file writable, and open it with read_only=False"
@@ -115,7 +115,7 @@ def check_format(database: sqlite3.Connection, path: Path) -> None:
         tables = {sql for (sql,) in database.execute("SELECT sql FROM sqlite_master") if sql}
     except sqlite3.DatabaseError as error:
         if "lock" in str(error):
-            raise FormatError("another program is opening the map", where=path) from error
+            raise FormatError("another process is opening the map", where=path) from error
         raise FormatError("not a map of recon, or damaged", where=path, got=str(error)) from error
     if ours == _OURS and number > FORMAT:
         raise FormatError(

@@ -110,7 +110,7 @@ def from_bytes(text: str, read: Callable[[int], bytearray], most: int) -> dict[s
 
     tree = restored(json.loads(text))
     if not isinstance(tree, dict):
-        raise FormatError("a record of the map is no tree")
+        raise FormatError("a record of the map is not valid")
     return tree
 
 

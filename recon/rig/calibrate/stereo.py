@@ -46,8 +46,8 @@ _OUTLIER_RATIO: Final = 3.0
 _OUTLIER_PX: Final = 0.3  # … but never those with an rms error below this
 _MAX_RMS_PX: Final = 2.0  # largest rms error of an accepted calibration
 _MIN_VIEWS: Final = 5  # minimum number of views with the board
-# A view repeats another if the corners moved by less than this fraction of the board's size (rms, in
-# the image): by what a hand moves that holds it still, 8 mm on 9 by 6 squares of 25 mm.
+# A view repeats another if the corners moved by less than this fraction of the board's size (rms,
+# in the image): by what a hand moves that holds it still, 8 mm on 9 by 6 squares of 25 mm.
 _STILL: Final = 0.1
 
 

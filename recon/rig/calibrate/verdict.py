@@ -53,8 +53,8 @@ _TEXTS: Final = {
     "coverage": "the board was seen in {percent:.0f} % of the {side} image: the lens is guessed "
     "elsewhere; show it in every corner",
     "together": "both cameras together fit worse than alone: not synchronised, or moved?",
-    "rows": "the epipolar error is {epipolar_95_px:.2f} px after rectification (95 % of the corners are "
-    "better): matching fails there; is the board flat, does --model suit?",
+    "rows": "the epipolar error is {epipolar_95_px:.2f} px after rectification (95 % of the "
+    "corners are better): matching fails there; is the board flat, does --model suit?",
     "baseline": "baseline is {baseline_m:.3g} m: are the squares really {square_mm:g} mm?",
     "square": "size of a square not given: every length is in squares; add it, as in :25mm",
     "order": "names do not say which images belong together: paired by their order",

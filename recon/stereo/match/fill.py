@@ -219,7 +219,8 @@ def fit_segments(
     """Write the planes of the pixels in segments that have one, (SEGMENTATIONS, 3, H, W).
 
     ``guide``, uint8 (H, W, 3), are smoothed colours. What was seen counts by its confidence.
-    Returns which fraction of the segment of a pixel lies on its plane, float32 (SEGMENTATIONS, H, W).
+    Returns which fraction of the segment of a pixel lies on its plane, float32 (SEGMENTATIONS, H,
+    W).
     """
     ratios = np.zeros((SEGMENTATIONS, *guide.shape[:2]), np.float32)
     # By how much each pixel differs from those above and to the left, over the channels.

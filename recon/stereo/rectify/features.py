@@ -247,8 +247,8 @@ def check_inspection(inspection: PairInspection, where: str | None = None) -> tu
         line = (
             "left and right rows are not aligned: the right image is "
             f"{abs(inspection.epipolar_error_px):.0f} px too {side} (expected "
-            f"under {_WARN_EPIPOLAR_PX:g} px); depth will be poor or wrong: recon audit --repair FILE "
-            "writes a calibration of the pairs that aligns them"
+            f"under {_WARN_EPIPOLAR_PX:g} px); depth will be poor or wrong: recon audit --repair "
+            "FILE writes a calibration of the pairs that aligns them"
         )
         return (line,)
     return ()

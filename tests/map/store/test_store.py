@@ -141,7 +141,7 @@ def test_a_reader_sees_whole_commits_while_another_program_writes(tmp_path):
     with Store.create(path) as writer:
         writer.put("rays", 0, _record(1))
         writer.commit()
-        with pytest.raises(OutputError, match="another program uses the map"):
+        with pytest.raises(OutputError, match="another process uses the map"):
             Store.open(path)
         with Store.open(path, read_only=True) as reader:
             writer.put("rays", 0, _record(2))

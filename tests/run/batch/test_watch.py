@@ -113,10 +113,8 @@ def test_where_there_is_no_terminal_each_change_is_a_line(folder):
         "b: succeeded, try 2, 2.0 s",
     ]
     assert set(lines[:-2]) <= {"a: running, try 1, 0.0 s"}
-    assert (
-        done.stderr
-        == f"warning: nobody runs this batch; recon batch --resume {folder} does what is missing\n"
-    )
+    hint = f"recon batch --resume {folder} does what is missing"
+    assert done.stderr == f"warning: no process runs this batch; {hint}\n"
 
 
 def test_a_folder_without_a_batch_is_one_line(tmp_path):
