@@ -6,8 +6,8 @@ SceneFlow. A disparity is measured, or inferred from planes around it; figures a
 pixels, in per cent. Of those whose truth is known: `measured` and `inferred`, whose errors are
 `off by 2` and `off by 3` (in pixels, of those given), and whose confidence is compared with the
 fraction within a pixel (`ece`). `in none` are the pixels of sky and of what is dark that have a
-disparity all the same. `other side`: of all pixels within 5 px of a step of depth, those with the disparity of the
-other side. `off by 2` alone is of all that is given.
+disparity all the same. `other side`: of all pixels within 5 px of a step of depth, those with the
+disparity of the other side. `off by 2` alone is of all that is given.
 
 Examples:
     python benchmarks/pairs.py --json

@@ -1,4 +1,4 @@
-"""Names of settings from before 1.0, in files, options and maps: all of them, to be dropped as one.
+"""Names from before 1.0, of settings and of keys in JSON: all of them, to be dropped as one.
 
 A name that has a new one is read under that, for one version. What became a constant is read if it
 has the value of that constant, and refused else.
@@ -40,6 +40,7 @@ RENAMED: Final[dict[str, Renamed]] = {
         for name, default in settings.items()
     },
     **{f"matching.{matcher}.fill": Renamed("matching.fill") for matcher in _COMMON},
+    "odometry.prior.sigma_share": Renamed("odometry.prior.sigma_ratio", 0.03),
     "matching.opencv.block_px": Renamed("matching.window_px", None),
     "mesh.pair_surface": Renamed("mesh.surface", "grid"),
     "mesh.map_surface": Renamed("mesh.surface", "voxels", values={"voxels": "grid"}),
@@ -175,3 +176,61 @@ def _same(value: Any, other: Any, scale: float) -> bool:
 
 def _written(value: Any, scale: float) -> Any:
     return scale * value.road_m if isinstance(value, OnRoad) else value
+
+
+FORMER_KEYS: Final = {
+    "rig.epipolar_error_px": "rows_px",
+    "rig.right_time_offset": "right_late",
+    "imu.time_offset_ms": "late_ms",
+    "loops.dense_ratio": "dense_share",
+    "segments": "drive_sessions",
+    "time_offset_frames": "lag_frames",
+    "repaired": "mended",
+    "repair_pitch_deg": "mend_pitch_deg",
+    "repair_roll_deg": "mend_roll_deg",
+    "epipolar_noise_px": "row_noise_px",
+    **{
+        f"epipolar_error_{part}px": f"row_error_{part}px"
+        for part in (
+            "",
+            "mean_",
+            "spread_",
+            "rms_",
+            "median_",
+            "95_",
+            "before_",
+            "after_",
+            "held_out_",
+        )
+    },
+    **{
+        f"{name}ratio": f"{name}share"
+        for name in (
+            "",
+            "valid_",
+            "swapped_",
+            "tilted_",
+            "calibration_",
+            "matching_",
+            "icp_",
+            "path_",
+        )
+    },
+    "grid_size": "occupancy_size",
+}
+"""Keys of summaries and events, and what they were called: both are written, for one version."""
+
+
+def with_former_keys(value: Any, group: str = "") -> Any:
+    """Return what is ready for JSON, each key that was renamed under its former name, too."""
+    if isinstance(value, list):
+        return [with_former_keys(item, group) for item in value]
+    if not isinstance(value, Mapping):
+        return value
+    found: dict[str, Any] = {}
+    for key, item in value.items():
+        found[key] = with_former_keys(item, key)
+        former = FORMER_KEYS.get(f"{group}.{key}", FORMER_KEYS.get(key))
+        if former is not None and former not in value:
+            found[former] = found[key]
+    return found

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.geometry.se3 import invert, quaternion_from_rotation
+from recon.core.renamed import with_former_keys
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.io.atomic import write_text
@@ -68,7 +69,7 @@ def export_paths(
             ]
             for kind in ("closed", "refused")
         }
-        write_json(folder / "loops.json", loops)
+        write_json(folder / "loops.json", with_former_keys(loops))
 
 
 def export_sessions(map_: MapFile, folder: Path) -> None:

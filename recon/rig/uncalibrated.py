@@ -56,9 +56,7 @@ class UncalibratedRectification:
     model: str  # what aligns the rows: "raw" (nothing to do), "rotation" or "homographies"
     matches: int  # number of all matches
     inliers: int  # number of those that the homographies bring onto one row
-    epipolar_error_before_px: (
-        float  # median absolute epipolar error of all matches of all pairs, raw
-    )
+    epipolar_error_before_px: float  # median of absolute errors of all matches of all pairs, raw
     epipolar_error_after_px: float  # the same, rectified
     epipolar_error_held_out_px: float  # mean of matches held out of the fit; NaN = too few
     disparity_range_px: tuple[float, float]  # 1st and 99th percentile of the rectified disparity

@@ -277,7 +277,7 @@ class FrameResult:
             "index": self.index,
             "total": self.total,
             "seconds": round(self.seconds, 4),
-            "valid_ratio": _finite(self.valid_ratio),
+            **dict.fromkeys(("valid_ratio", "valid_share"), _finite(self.valid_ratio)),
             "points": self.points,
             "position_m": [_finite(x) for x in self.T_world_camera[:3, 3].tolist()],
             "measured": self.health.ok,

@@ -22,7 +22,7 @@ _REFITS: Final = 8
 
 @dataclass(frozen=True)
 class EpipolarAlignment:
-    """Epipolar errors (right minus left), and the rotation of the right camera that lessens them."""
+    """Epipolar errors (right minus left), and the rotation of the right camera that helps."""
 
     agreeing: int  # number of features that agree with the rotation
     mean_px: float  # mean epipolar error of the agreeing features
