@@ -98,7 +98,7 @@ def test_freezing_copies_nothing_and_leaves_the_callers_array_writeable():
         (PATH, {"T_world_camera": POSES * [[[1]], [[NAN]], [[1]]]}, "pose 1 is not finite"),
         (LENS, {"matrix": np.full((3, 3), NAN)}, "not finite"),
         (LENS, {"matrix": -np.eye(3)}, "focal length is not positive"),
-        (LENS, {"matrix": np.diag([500.0, 500, 2])}, "none of a lens"),
+        (LENS, {"matrix": np.diag([500.0, 500, 2])}, "not that of a lens"),
         (LENS, {"distortion": np.full(5, 2e6)}, "distortion is implausible"),
         (LENS, {"model": "fisheye"}, "four distortion .*got 5"),
         (RIG, {"T_right_left": np.eye(4)}, "baseline is zero"),
@@ -187,7 +187,7 @@ def test_disparity_and_truth_are_made_of_any_real_numbers_and_a_mask():
     assert DisparityTruth.from_values(GIVEN, levels == 255).nonocc.sum() == 1
     assert DisparityTruth.from_values(GIVEN).nonocc.sum() == 2
     for mask in (np.ones((2, 3), np.uint8), np.ones((3, 2), bool), 255):
-        with pytest.raises(ShapeError, match="no mask of the truth"):
+        with pytest.raises(ShapeError, match="not a mask of the ground truth"):
             DisparityTruth.from_values(GIVEN, mask)  # type: ignore[arg-type]
 
 

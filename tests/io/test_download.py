@@ -55,7 +55,7 @@ def test_a_download_goes_on_where_a_connection_breaks_off(mirror, fetch, monkeyp
     assert fetch().read_bytes() == CONTENT
     assert mirror.asked == ["", "bytes=1199999-", "bytes=2399998-"]
     monkeypatch.setattr(module.shutil, "disk_usage", lambda path: SimpleNamespace(free=1))
-    with pytest.raises(OutputError, match="no room for the download"):
+    with pytest.raises(OutputError, match="not enough disk space"):
         fetch()
 
 

@@ -69,7 +69,7 @@ def test_a_system_that_positions_on_earth_have_not_is_refused(degrees, crs, why)
         ("WGS84 UTM 0S", "unknown coordinate system"),
         ("WGS84 UTM 61N", "unknown coordinate system"),  # with the number of a polar system
         ("EPSG:32700", "cannot be converted"),
-        ("EPSG:2263", "not metres"),
+        ("EPSG:2263", "easting and northing in metres"),
     ],
 )
 def test_a_system_of_control_points_that_there_is_not_is_refused_by_their_file(tmp_path, head, why):

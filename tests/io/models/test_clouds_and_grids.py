@@ -309,9 +309,9 @@ def test_a_raster_and_a_bag_on_a_full_disk_are_named(tmp_path):
     [
         ("EPSG:99", "unknown coordinate system"),
         ("Gauss", "unknown coordinate system"),
-        ("EPSG:4326", "not metres"),  # degrees
-        ("EPSG:4978", "not metres"),  # metres, but from the centre of the earth
-        ("EPSG:2263", "not metres"),  # feet
+        ("EPSG:4326", "easting and northing in metres"),  # degrees
+        ("EPSG:4978", "easting and northing in metres"),  # metres, but from the centre of the earth
+        ("EPSG:2263", "easting and northing in metres"),  # feet
         ("EPSG:32600", "cannot be converted.*such as EPSG:25832"),  # UTM without a zone
         ("EPSG:32700", "cannot be converted"),
     ],
@@ -465,12 +465,9 @@ def test_costs_are_what_nav2_reads_and_the_reason_is_in_what_it_does_not_look_at
     fields = yaml.safe_load(description.read_text())
     assert (fields["resolution"], fields["origin"]) == (0.2, [-3.4, 1.25, 0.0])
     assert image.with_suffix(".wld").exists()
-
-
-def test_every_cost_comes_back(tmp_path):
-    cells = np.arange(101, dtype=np.int8)[None]
-    _, path = write_nav2_costs(tmp_path / "all", OccupancyGrid(cells, 0.1, (0.0, 0.0)))
-    np.testing.assert_array_equal(as_nav2_loads(path, ends_apart=False), cells)
+    every = np.arange(101, dtype=np.int8)[None]
+    _, path = write_nav2_costs(tmp_path / "all", OccupancyGrid(every, 0.1, (0.0, 0.0)))
+    np.testing.assert_array_equal(as_nav2_loads(path, ends_apart=False), every)
 
 
 def test_negated_maps_are_read_and_the_origin_is_written_as_it_is_meant(tmp_path):
