@@ -24,6 +24,8 @@ NOT_RUN = {
     r"git clone": "needs a network",
     r"source .venv/bin/activate": "the tests run in an environment that is active",
     r"pip install": "changes the environment; tests/docs/stand_ins.py installs the package",
+    r"recon map rgbd_dataset_": "needs data; tests/sources/test_rgbd.py maps a rendered one",
+    r"python benchmarks/two_checkouts": "takes long; tests/flow/test_speed_gate.py has its parts",
     r"recon datasets (fetch|verify)": "needs a network; tests/commands/test_datasets.py has one",
     r"dask |for host in |sbatch |kubectl |recon (batch|map) .* --scheduler": "needs a cluster",
     r"recon capture 0 2": "needs two cameras; tests/commands/test_cameras.py records from videos",
