@@ -215,7 +215,7 @@ def audit(
     repeated frames, exposure, focus and baseline, and predicts the depth error.
     The motion of the drive shows how the rig differs from its calibration, but
     not the scale; recon map uses that rig by itself.
-    With --out, sample pairs, epipolar errors and disparities are drawn in a report.
+    With --out, a report has sample pairs, epipolar errors and disparities.
 
     Examples:
       recon audit drive.bag --calib camchain.yaml

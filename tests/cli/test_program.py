@@ -102,7 +102,7 @@ def test_what_was_begun_is_resumed_with_its_limits(tmp_path):
 
 
 def test_a_sweep_spreads_every_job_over_every_combination_of_right_values():
-    sweep = {"matching__sad__window_px": [9, 11], "matching__matcher": ["sad", "sgm"]}
+    sweep = {"matching__window_px": [9, 11], "matching__matcher": ["sad", "sgm"]}
     jobs = plan(DRIVE, {**DRIVE, "name": "b"}, **sweep)
     assert (len(jobs), jobs[0].name) == (8, "a_window_px=9_matcher=sad")
     found = jobs[0].words
@@ -111,8 +111,8 @@ def test_a_sweep_spreads_every_job_over_every_combination_of_right_values():
     )  # fmt: skip
     assert jobs[7].name == "b_window_px=11_matcher=sgm"
     assert jobs[7].swept == {"matching.window_px": 11, "matching.matcher": "sgm"}
-    with pytest.raises(SettingsError, match=r"job a: .*matching\.sad\.window_px"):
-        plan(DRIVE, matching__sad__window_px=[9, 11, "much"])
+    with pytest.raises(SettingsError, match=r"job a: .*matching\.window_px"):
+        plan(DRIVE, matching__window_px=[9, 11, "much"])
 
 
 TWO = {"command": "evaluate disparity", "source": ["a", "b"]}
@@ -123,7 +123,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"source": []}, "job a: job has no source"),
     ({"source": ["x", "--repair=/abs"]}, "source is an option"),
     ({"name": "../a"}, "not a name of a folder"),
-    ({"set": ["matching.window_px=9"]}, "job a: .*matching.window_px"),
+    ({"set": ["matching.window_px=8"]}, "job a: .*matching.window_px"),
     ({"options": ["--no-such"]}, "job a: No such option.*no-such"),
     ({"options": ["another"]}, "unexpected extra argument"),
     ({"command": "evaluate trajectory"}, "Missing argument"),

@@ -54,11 +54,11 @@ def test_cloud_and_octomap_of_tiles_are_those_of_the_whole(mapped, folder):
     written = write_products(mapped, folder)
     whole = transform_cloud(mapped.cloud, mapped.T_map_world, frame="map")
     back = read_ply(folder.path("map/cloud.ply"))
-    assert written.figures.to_json()["points"] == len(back) == len(written.cloud) > 1000
+    assert written.figures["cloud"].to_json()["points"] == len(back) == len(written.cloud) > 1000
     assert back.frame == "map"
     for name in ("xyz", "normals", "rgb"):
         np.testing.assert_array_equal(getattr(back, name), getattr(whole, name))
-    assert written.figures.to_json()["voxels"] == len(mapped.voxels) > 1000
+    assert written.figures["octomap"].to_json()["voxels"] == len(mapped.voxels) > 1000
     files = write_octomap(folder.path("whole"), drop_undecided(mapped.voxels))
     for theirs, end in zip(files, ("bt", "ot"), strict=True):
         assert folder.path(f"map/octomap.{end}").read_bytes() == theirs.read_bytes()
@@ -145,7 +145,10 @@ def test_a_map_too_large_for_an_octomap_has_all_else(mapped, folder, monkeypatch
     folder.path("map/octomap.bt").unlink()
     folder.path("map/octomap.ot").unlink()
     written = write_products(mapped, folder)
-    assert written.figures.to_json()["voxels"] == whole.figures.to_json()["voxels"]
+    assert (
+        written.figures["octomap"].to_json()["voxels"]
+        == whole.figures["octomap"].to_json()["voxels"]
+    )
     [warning] = written.warnings
     assert "no OctoMap" in warning
     np.testing.assert_array_equal(written.grid.cells, whole.grid.cells)
@@ -213,7 +216,8 @@ def test_a_costmap_of_tiles_lies_on_the_grid_and_has_the_robot_in_it(mapped, fol
     column, row = np.floor((path_m - costs.origin_m) / costs.resolution_m).astype(int).T
     assert (costs.cells[row, column] == FREE).all()
     figures = [
-        made.figures.to_json()[f"costmap_{name}_cells"] for name in ("free", "lethal", "uncertain")
+        made.figures["costmap"].to_json()[f"costmap_{name}_cells"]
+        for name in ("free", "lethal", "uncertain")
     ]
     assert min(figures) > 0
     assert folder.path("map/costmap.png").exists()

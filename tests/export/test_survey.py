@@ -228,7 +228,7 @@ def test_a_file_may_state_how_well_positions_were_measured(place, columns):
     assert place(noisy(1.5, seed=4)).figures().to_json()["positions_left_out"] == 0
     assert 10.0 < place(noisy(10.0)).rms_m < 20.0
     assert place(stated(10.0)).rms_m > 10.0
-    with pytest.raises(EvaluationError, match="neither drift nor noise explains"):
+    with pytest.raises(EvaluationError, match="differ by more than drift and noise explain"):
         place(stated(0.1))
     with pytest.raises(FormatError, match="standard deviation"):
         place(stated(0.0))

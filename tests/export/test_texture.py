@@ -80,8 +80,8 @@ def test_the_picture_shows_what_is_finer_than_triangles():
     # A wave of 0.3 m has a level of each pixel of 5 to 10 mm that differs by some of 60.
     assert np.abs(rgb - colour_at(places))[near].mean() < 8
     assert rgb[near].std(axis=0)[:2].min() > 30
-    assert figures["textured"] > 0.8
-    assert 0.002 < figures["texel_m"] < 0.02
+    assert figures.textured > 0.8
+    assert 0.002 < figures.texel_m < 0.02
 
 
 def test_exposures_are_evened_and_those_of_the_fused_points():
@@ -192,8 +192,8 @@ def test_charts_do_not_overlap_and_keep_lengths():
 def test_texels_grow_until_the_picture_fits():
     views = [photograph(0, 0.0, 0.0)]
     _, _, figures = painted(ground(), views, most_px=128)
-    assert figures["texture_px"] <= 128
-    assert figures["texel_m"] > 5 / 128
+    assert figures.texture_px <= 128
+    assert figures.texel_m > 5 / 128
 
 
 def test_a_picture_too_small_for_the_charts_is_an_error():

@@ -57,7 +57,7 @@ def test_every_product_is_what_a_run_has_and_nothing_else(mapped, tmp_path, name
     path = tmp_path / "there" / Path(product.name).name
     found = recon.export_map(mapped, name, path, threads=1)
     assert (found.figures, [*found.warnings]) == (
-        made.figures,
+        made.figures[name],
         [*mapped.map.doubts, *made.warnings],
     )
     if product.suffix:

@@ -150,6 +150,12 @@ def drive(request):
     )  # fmt: skip
 
 
+class Found(dict[str, object]):
+    """Figures as the summary of a run has them."""
+
+    to_json = dict.copy
+
+
 @pytest.fixture
 def view(pair, disparity, cloud):
     """A `PairResult`."""
@@ -162,6 +168,6 @@ def view(pair, disparity, cloud):
         truth=DisparityTruth(disparity.values + 1, disparity.valid),
         metrics=DisparityMetrics({2.0: 10.0}, 25.0, 1.0, 1.0, 1440),
         by_kind={},
-        summary={"points": 2000, "warnings": ["a warning"]},
+        summary=Found({"points": 2000, "warnings": ["a warning"]}),
         warnings=("a warning",),
     )

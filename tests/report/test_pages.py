@@ -389,14 +389,7 @@ def test_page_of_a_pair_with_truth_of_another_size_or_without_any_disparity_is_m
     assert "In 3-D" not in page
 
 
-class Found(dict[str, Any]):
-    """Figures as the summary of a run has them."""
-
-    to_json = dict.copy
-
-
 def test_runs_leave_their_pages_and_images(drive, view, tmp_path):
-    view.summary = Found(view.summary)
     for name, write in (
         ("drive", lambda run: write_page(drive_page(drive), run)),
         ("pair", lambda run: write_pair_page(view, run)),
