@@ -7,7 +7,8 @@ from typing import Final
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from recon.core.machine import MemorySettings
+from recon.core.errors import MemoryLimitError
+from recon.core.machine import peak_memory_mb, return_free_memory
 from recon.core.settings import Length, Settings
 from recon.map.builders import OccupancySettings, SubmapSettings
 from recon.map.fusion import FusionSettings
@@ -20,6 +21,53 @@ from recon.odometry.protocol import Odometry
 from recon.odometry.registry import check_odometry
 from recon.odometry.settings import OdometrySettings, RigSettings
 from recon.stereo.frame import StereoSettings
+
+#: Fractions of the limit for an open submap, the cells of one tile, and what was read from the map.
+#: Sums grow by doubling and are copied when closed, so each briefly costs several times its size;
+#: most of the limit is left to the libraries, the images and the matcher.
+_SUBMAP_RATIO: Final = 1 / 40
+_TILE_RATIO: Final = 1 / 24
+_CACHE_RATIO: Final = 1 / 10
+_CACHE_BYTES: Final = 100_000_000
+
+
+class MemorySettings(Settings):
+    """How much memory a run may take."""
+
+    limit_mb: float | None = Field(None, ge=1.0, le=1_000_000_000.0)
+    """Largest resident memory of the process, in 10⁶ bytes; none = no limit. Submaps and tiles are
+    made smaller to meet it, so results may differ by rounding."""
+
+    @property
+    def submap_bytes(self) -> int | None:
+        """Size at which a submap is closed; None = closed by the path alone."""
+        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _SUBMAP_RATIO)
+
+    @property
+    def tile_bytes(self) -> int | None:
+        """Largest size of a tile's cells before they are merged; None = unlimited."""
+        return None if self.limit_mb is None else int(1e6 * self.limit_mb * _TILE_RATIO)
+
+    @property
+    def cache_bytes(self) -> int:
+        """Most that is kept in memory of what was read from a map."""
+        return _CACHE_BYTES if self.limit_mb is None else int(1e6 * self.limit_mb * _CACHE_RATIO)
+
+    def check(self, where: str) -> None:
+        """Stop a run that exceeds the limit; else return what is free, for what comes next."""
+        if self.limit_mb is None:
+            return
+        if peak_memory_mb() > self.limit_mb:
+            raise MemoryLimitError(
+                "the memory limit cannot be kept",
+                where=where,
+                got=f"{peak_memory_mb():.0f} MB",
+                expected=f"at most {self.limit_mb:g} MB",
+                hint="give more with --memory-limit, or take smaller images, fewer disparities "
+                "or a coarser map",
+            )
+        return_free_memory()
+
 
 SCALES: Final = (1e-5, 1e3)
 
