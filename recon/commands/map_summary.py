@@ -113,7 +113,7 @@ class MapSummary(RunSummary):
         drift = self.expected_drift_percent
         expected = "" if drift is None else f" · drift expected {drift:.2g} %"
         path = f"{metres(self.path_length_m)} of path{expected}"
-        rate = () if self.fps is None else (f"{self.fps:.1f} frames/s",)
+        rate = () if self.fps is None else (f"maps {self.fps:.1f} frames/s",)
         live = self.read.live
         time_offset_ms = None if live is None else live.latency_ms.p95
         poses = () if time_offset_ms is None else (f"95 % of poses in {time_offset_ms:.0f} ms",)
@@ -123,7 +123,7 @@ class MapSummary(RunSummary):
             *self.made.rows(self.voxel_m),
             *self._accuracy(),
             *self.cost_row(*rate, *poses),
-            ("next", f"recon view {shown_path(self.out or '')}"),
+            ("next", self.open_view()),
         ]
 
     def _accuracy(self) -> Rows:
@@ -178,15 +178,16 @@ class JoinedSummary(RunSummary):
         apart = "" if linked == drives else f" of {drives}"
         places = f"{counted(self.links.count, 'place')} seen by two drives"
         misfit_m = self.positions_misfit_rms_m
-        off = "" if misfit_m is None else f", {metres(misfit_m)} off measured positions (RMS)"
+        off = "" if misfit_m is None else f"{metres(misfit_m)} off measured positions (RMS)"
+        held = ", ".join(text for text in (places if drives > 1 else "", off) if text)
         path = f"{counted(self.frames, 'frame')}, {metres(self.path_length_m)} of path"
         return [
             (f"map of {linked}{apart} {'drive' if drives == 1 else 'drives'}, {path}",),
             *self.folder_row(),
             *self.made.rows(),
-            ("links", places + off),
+            *([("links" if drives > 1 else "survey", held)] if held else []),
             *self.cost_row(),
-            ("next", f"recon view {shown_path(self.out or '')}"),
+            ("next", self.open_view()),
         ]
 
 
@@ -232,9 +233,10 @@ class ExportSummary(RunSummary):
         out = self.out or ""
         if "mesh" in self.products:
             return f"meshlab {shown_path(out, 'mesh', 'mesh.mlp')}"
-        if "grid" in self.products:
-            file = shown_path(out, PRODUCTS["grid"].name)
-            return f"ros2 run nav2_map_server map_server --ros-args -p yaml_filename:={file}"
+        for name in ("grid", "costmap"):
+            if name in self.products:
+                file = shown_path(out, PRODUCTS[name].name)
+                return f"ros2 run nav2_map_server map_server --ros-args -p yaml_filename:={file}"
         return f"recon view {shown_path(self.run)}"
 
 

@@ -10,6 +10,7 @@ import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -98,6 +99,12 @@ class RunSummary(Summary):
     def open_report(self) -> str:
         """Return the command that opens the report."""
         return f"xdg-open {shown_path(self.out or '', 'report.html')}"
+
+    def open_view(self) -> str:
+        """Return the command that shows the result: the report, where the extra view is missing."""
+        if find_spec("viser") is None:
+            return self.open_report()
+        return f"recon view {shown_path(self.out or '')}"
 
     def folder_row(self) -> Rows:
         """Return the line of the result folder, if there is one."""

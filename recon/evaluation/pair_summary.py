@@ -124,5 +124,5 @@ class PairSummary(RunSummary):
             ("cloud", PAIR_CLOUD, cloud),
             *([mesh] if self.faces else []),
             *self.cost_row(),
-            ("next", f"recon view {out}" if self.faces else f"recon mesh {out}"),
+            ("next", self.open_view() if self.faces else f"recon mesh {out}"),
         ]

@@ -375,4 +375,5 @@ def interpolation_warnings(truth: Trajectory, segments: Segments) -> list[str]:
     first, last = np.flatnonzero(found)[[0, -1]]
     which = f"{counted(int(found.sum()), 'true pose')} (between {first} and {last})"
     where = f"{resting} of {counted(len(segments.first), 'segment')} begin or end there"
-    return [f"{which} turn evenly, as interpolated ones do: {where}"]
+    doubt = "as interpolated ones do, so part of the drift may be the truth's"
+    return [f"{which} turn evenly, {doubt}: {where}"]

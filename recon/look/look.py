@@ -206,7 +206,7 @@ def _read(
 
     with serial_algebra():
         found = side_by_side(read, windows, threads=FEW)
-        parts = list(tracked(found, "windows", "look at the drive", total=len(windows)))
+        parts = list(tracked(found, "windows", "look at the images", total=len(windows)))
     sample = Sample.joined(sample for sample, _ in parts)
     return sample, [one for _, tracks in parts for one in tracks]
 

@@ -13,7 +13,7 @@ import numpy as np
 from recon.core.errors import MappingError, RegistrationError
 from recon.core.progress import series, stage
 from recon.core.settings import scaled
-from recon.core.summary import Figures, Rows, RunSummary, inline, shown_path
+from recon.core.summary import Figures, Rows, RunSummary, inline
 from recon.core.text import counted, metres
 from recon.core.values import OccupancyGrid, Recorded, Trajectory
 from recon.core.values.arrays import Bool, Float64
@@ -268,7 +268,7 @@ class LocalizeSummary(RunSummary):
             ("poses", "trajectory_tum.txt", where + sure),
             ("others", f"{left}; lost {counted(found.frames_lost, 'time')}"),
             *self.cost_row(f"95 % of frames in {ms:.0f} ms"),
-            ("next", f"recon view {shown_path(self.out or '')}"),
+            ("next", self.open_view()),
         ]
 
 
