@@ -213,7 +213,7 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     ("laz --crs EPSG:25832", "--crs: there are no positions"),
     ("laz --georeference none.txt --antenna 1,2", "not three numbers"),
     ("grid --georeference none.txt", "no product has the coordinates"),
-    ("laz --georeference none.txt --crs EPSG:4326", "not metres"),
+    ("laz --georeference none.txt --crs EPSG:4326", "easting and northing in metres"),
     ("laz --georeference none.txt", "none.txt"),
     ("cloud,gird", "--to: unknown product (got gird, expected cloud, octomap, grid"),
     ("mesh --format step", "unknown mesh format (got step"),
