@@ -152,15 +152,18 @@ def load_config(
     named = own.get("preset") if preset is None else preset
     chosen = {} if named is None else {"preset": named}
     usual = merge(current_names(_nested(defaults or {}))[0], preset_values(named))
-    values = given = merge(merge(usual, own), chosen)
+    given = merge(merge(usual, own), chosen)
+    changes: dict[str, Any] = {}
     for one in [overrides] if isinstance(overrides, str | Mapping) else overrides:
         # Several settings stand in one text with commas between.
         for part in map(_parse_override, _NEXT.split(one)) if isinstance(one, str) else [one]:
-            changed, old = current_names(_nested(part))
-            if changed.get("preset") is not None:
+            nested = _nested(part)
+            if nested.get("preset") is not None:
                 hint = "--preset NAME, or recon.load_config(preset=NAME)"
                 raise SettingsError("a preset is not one of the settings", got=part, hint=hint)
-            values, notes = merge(values, changed), [*notes, *old]
+            changes = merge(changes, nested)
+    changed, old = current_names(changes, given)
+    values, notes = merge(given, changed), [*notes, *old]
     if notes:
         warnings.warn("; ".join(dict.fromkeys(notes)), FutureWarning, stacklevel=2)
     try:
@@ -176,7 +179,7 @@ def preset_values(name: str | None) -> Mapping[str, Any]:
     if name is None:
         return {}
     known: Mapping[str, Mapping[str, Any]] = parse_yaml(presets_text(), "presets.yaml")
-    if name not in known:
+    if not isinstance(name, str) or name not in known:
         near = difflib.get_close_matches(str(name), known, n=1)
         raise SettingsError(
             "unknown preset",

@@ -6,6 +6,7 @@ has the value of that constant, and refused else.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
@@ -77,6 +78,7 @@ JOINED: Final = {
 """New settings, each of two values, of which each was one."""
 _IN_A_ROOM: Final[dict[str, Any]] = {"street.baseline_m": 0.12, "street.pitch_deg": 8.0}
 _SINCE: Final = "1.0"
+_LARGE: Final = 1e300  # whole numbers may be too large for what is compared
 _NOTES: Final = {
     **{name: f"{name} is {new.to} since {_SINCE}" for name, new in RENAMED.items()},
     **{n: f"{n} is a part of {to} since {_SINCE}" for to, names in JOINED.items() for n in names},
@@ -84,8 +86,13 @@ _NOTES: Final = {
 }
 
 
-def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+def current_names(
+    values: Mapping[str, Any], changed: Mapping[str, Any] | None = None
+) -> tuple[dict[str, Any], list[str]]:
     """Return nested values of settings under the names of today, and what to say of old ones.
+
+    ``changed`` are settings that the values change, which are a wish then: what is as it was by
+    default says something, too.
 
     Raises:
         SettingsError: A constant of today has another value, or names of one setting differ.
@@ -93,9 +100,10 @@ def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]
     found = {name: value for name in _NOTES if (value := _at(values, name)) is not ...}
     if not found:
         return dict(values), []
-    scale = _at(values, "scene.scale")
+    whole = merge(changed or {}, values)
+    scale = _at(whole, "scene.scale")
     scale = scale if isinstance(scale, int | float) else 1.0
-    constants = {**CONSTANTS, **(_IN_A_ROOM if _at(values, "street.path") == "room" else {})}
+    constants = {**CONSTANTS, **(_IN_A_ROOM if _at(whole, "street.path") == "room" else {})}
     for name in found.keys() & constants.keys():
         if not _same(found[name], constants[name], scale):
             raise SettingsError(
@@ -106,7 +114,7 @@ def current_names(values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]
             )
     kept = _without(values, found)
     idle = _idle(_at(values, "matching"))
-    for to, name, value in _moved(found, scale):
+    for to, name, value in _moved(found, scale, every=changed is not None):
         if name.startswith(idle):
             continue
         given = _at(kept, to)
@@ -132,14 +140,17 @@ def _idle(matching: Any) -> tuple[str, ...]:
     return tuple(f"matching.{name}." for name in _COMMON if name not in used)
 
 
-def _moved(found: Mapping[str, Any], scale: float) -> Iterator[tuple[str, str, Any]]:
-    """Yield new name, old name and value of what is not as it is by default."""
+def _moved(
+    found: Mapping[str, Any], scale: float, *, every: bool
+) -> Iterator[tuple[str, str, Any]]:
+    """Yield new name, old name and value of what is not as it is by default, or of ``every``."""
     for name, new in RENAMED.items():
-        if name in found and (new.default is ... or not _same(found[name], new.default, scale)):
+        idle = not every and new.default is not ... and _same(found.get(name), new.default, scale)
+        if name in found and not idle:
             yield new.to, name, new.values.get(str(found[name]), found[name])
     for to, names in JOINED.items():
         parts = [found.get(name) for name in names]
-        if set(parts) - {None, "none"}:
+        if any(part not in (None, "none") for part in parts):
             yield to, names[0], parts
 
 
@@ -170,7 +181,7 @@ def _same(value: Any, other: Any, scale: float) -> bool:
         return any(_same(value, one, scale) for one in other)
     value, other = None if value == "none" else value, _written(other, scale)
     if isinstance(value, int | float) and isinstance(other, int | float):
-        return abs(value - other) <= 1e-6 * abs(other)
+        return math.isclose(value, other, rel_tol=1e-6) if abs(value) < _LARGE else False
     return bool(value == other)
 
 
@@ -183,7 +194,7 @@ FORMER_KEYS: Final = {
     "rig.right_time_offset": "right_late",
     "imu.time_offset_ms": "late_ms",
     "loops.dense_ratio": "dense_share",
-    "segments": "drive_sessions",
+    ".segments": "drive_sessions",
     "time_offset_frames": "lag_frames",
     "repaired": "mended",
     "repair_pitch_deg": "mend_pitch_deg",
@@ -218,7 +229,10 @@ FORMER_KEYS: Final = {
     },
     "grid_size": "occupancy_size",
 }
-"""Keys of summaries and events, and what they were called: both are written, for one version."""
+"""Keys of summaries and events, and what they were called: both are written, for one version.
+
+Before the dot is the group that a key is in; nothing = it is one of the whole.
+"""
 
 
 def with_former_keys(value: Any, group: str = "") -> Any:

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import OutputError, ReconError, SourceError
+from recon.core.renamed import current_names
 from recon.core.progress import tracked
 from recon.core.summary import Figures
 from recon.core.values import Recorded, Rig, StereoPair
@@ -195,8 +196,9 @@ def _opened(session: Session, moved: Path | None) -> StereoSource:
         known = {"source": None, "kind": None, "mark": {}, **info.start.get(IMAGES, {})}
         path, kind = moved or (known["source"] and Path(known["source"])), known["kind"]
         mark = {"frames": info.frames, **known["mark"]}
-        street = StreetSettings.parse(info.config.get("street", {}))
-        settings = SourceSettings.parse(info.config.get("source", {}))
+        config, _ = current_names(info.config)
+        street = StreetSettings.parse(config.get("street", {}))
+        settings = SourceSettings.parse(config.get("source", {}))
     if info.description == SyntheticSource.description:
         source: StereoSource = SyntheticSource(street)
     elif path is None:

@@ -17,7 +17,7 @@ from recon.commands.config import (
     preset_text,
 )
 from recon.core.errors import SettingsError
-from recon.core.renamed import CONSTANTS, JOINED, RENAMED, current_names
+from recon.core.renamed import CONSTANTS, JOINED, RENAMED, current_names, with_former_keys
 from recon.core.settings import setting_names
 from recon.io.fields import write_yaml
 from recon.map.settings import DriveSettings
@@ -101,6 +101,36 @@ def test_old_values_that_there_are_no_more_are_refused_in_one_line(given, words)
     with pytest.raises(SettingsError, match=words) as refused:
         load_config(given)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("file", "options", "new"), [
+    ({"matching.window_px": 9}, ["matching.sad.window_px=11"], {"matching.window_px": 11}),
+    ({"mesh.surface": "poisson"}, ["mesh.map_surface=voxels"], {"mesh.surface": "grid"}),
+    ({}, ["capture.width_px=640", "capture.height_px=480"], {"capture.size_px": [640, 480]}),
+    ({"street.path": "room"}, ["street.baseline_m=0.12"], {"street.path": "room"}),
+    ({"scene.scale": 0.2}, ["odometry.max_range_m=6"], {"scene.scale": 0.2}),
+])  # fmt: skip
+def test_old_names_in_options_change_what_there_is_even_to_what_is_usual(file, options, new):
+    with pytest.warns(FutureWarning, match=r"since 1\.0"):
+        config = load_config(file, options)
+    assert config == load_config(new)
+
+
+@pytest.mark.parametrize("given", [
+    {"preset": ["fast"]}, {"preset": {"a": 1}}, {"capture.width_px": [1]},
+    {"matching.sgm.p1": 10**400},
+])  # fmt: skip
+def test_nonsense_by_names_of_any_age_is_refused(given):
+    with pytest.raises(SettingsError):
+        load_config(given)
+
+
+def test_only_the_segments_of_a_drive_have_a_former_name():
+    rows = [{"segments": 20}]
+    found = with_former_keys({"segments": [], "trajectory": {"segments": 20, "by_length": rows}})
+    assert found == {
+        "segments": [], "drive_sessions": [], "trajectory": {"segments": 20, "by_length": rows},
+    }  # fmt: skip
 
 
 def test_every_new_name_is_one_and_no_old_name_is():
