@@ -190,8 +190,11 @@ def _written(value: Any, scale: float) -> Any:
 
 
 FORMER_KEYS: Final = {
-    "rig.epipolar_error_px": "rows_px",
-    "rig.right_time_offset": "right_late",
+    **{
+        f"{group}.{key}": former
+        for group in ("rig", "rig_by_motion")
+        for key, former in (("epipolar_error_px", "rows_px"), ("right_time_offset", "right_late"))
+    },
     "imu.time_offset_ms": "late_ms",
     "loops.dense_ratio": "dense_share",
     ".segments": "drive_sessions",

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import OutputError, ReconError, SourceError
-from recon.core.renamed import current_names
 from recon.core.progress import tracked
+from recon.core.renamed import current_names
 from recon.core.summary import Figures
 from recon.core.values import Recorded, Rig, StereoPair
 from recon.core.values.arrays import Bool, Float64, UInt8

@@ -120,6 +120,7 @@ def test_old_names_in_options_change_what_there_is_even_to_what_is_usual(file, o
     {"preset": ["fast"]}, {"preset": {"a": 1}}, {"capture.width_px": [1]},
     {"matching.sgm.p1": 10**400},
 ])  # fmt: skip
+@pytest.mark.filterwarnings("ignore:.*since 1.0:FutureWarning")
 def test_nonsense_by_names_of_any_age_is_refused(given):
     with pytest.raises(SettingsError):
         load_config(given)
@@ -131,6 +132,12 @@ def test_only_the_segments_of_a_drive_have_a_former_name():
     assert found == {
         "segments": [], "drive_sessions": [], "trajectory": {"segments": 20, "by_length": rows},
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("group", ["rig", "rig_by_motion"])
+def test_a_rig_has_its_former_keys_wherever_it_stands(group):
+    found = with_former_keys({group: {"epipolar_error_px": 0.5, "right_time_offset": {}}})
+    assert found[group].items() >= {"rows_px": 0.5, "right_late": {}}.items()
 
 
 def test_every_new_name_is_one_and_no_old_name_is():
