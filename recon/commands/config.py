@@ -29,6 +29,7 @@ from recon.core.settings import (
     merge,
     suggest_names,
 )
+from recon.core.text import counted
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings
 from recon.io.fields import parse_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
@@ -165,7 +166,10 @@ def load_config(
     changed, old = current_names(changes, given)
     values, notes = merge(given, changed), [*notes, *old]
     if notes:
-        warnings.warn("; ".join(dict.fromkeys(notes)), FutureWarning, stacklevel=2)
+        first, *more = sorted(dict.fromkeys(notes), key=lambda note: " is used" not in note)
+        shown = "; ".join([first, *more[:2]])
+        rest = f"; and {counted(len(more) - 2, 'more name')} from before 1.0" if more[2:] else ""
+        warnings.warn(shown + rest, FutureWarning, stacklevel=2)
     try:
         return ReconConfig.parse(values)
     except SettingsError:

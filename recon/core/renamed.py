@@ -112,23 +112,26 @@ def current_names(
                 expected=_written(constants[name], scale),
                 hint="remove it, or use an earlier version",
             )
-    kept = _without(values, found)
+    kept, notes = _without(values, found), {name: _NOTES[name] for name in found}
     idle = _idle(_at(values, "matching"))
     for to, name, value in _moved(found, scale, every=changed is not None):
         if name.startswith(idle):
             continue
         given = _at(kept, to)
         if given is not ... and not _same(value, given, scale):
+            if changed is None and _at(values, to) is not ...:  # runs of before have both
+                notes[name] = f"{notes[name]}: {_shown(given)} is used, not {_shown(value)}"
+                continue
             raise SettingsError(
                 f"{name} is {to} since {_SINCE}, which has another value here",
-                got=f"{value} and {given}",
+                got=f"{_shown(value)} and {_shown(given)}",
                 hint=f"give {to} alone",
             )
         inner: Any = value
         for part in reversed(to.split(".")):
             inner = {part: inner}
         kept = merge(kept, inner)
-    return kept, [_NOTES[name] for name in found]
+    return kept, [*notes.values()]
 
 
 def _idle(matching: Any) -> tuple[str, ...]:
@@ -185,10 +188,17 @@ def _same(value: Any, other: Any, scale: float) -> bool:
     return bool(value == other)
 
 
+def _shown(value: Any) -> str:
+    return "none" if value is None else str(value)
+
+
 def _written(value: Any, scale: float) -> Any:
     return scale * value.road_m if isinstance(value, OnRoad) else value
 
 
+_OF_ERRORS: Final = (
+    "", "mean_", "spread_", "rms_", "median_", "95_", "before_", "after_", "held_out_",
+)  # fmt: skip
 FORMER_KEYS: Final = {
     **{
         f"{group}.{key}": former
@@ -203,32 +213,10 @@ FORMER_KEYS: Final = {
     "repair_pitch_deg": "mend_pitch_deg",
     "repair_roll_deg": "mend_roll_deg",
     "epipolar_noise_px": "row_noise_px",
-    **{
-        f"epipolar_error_{part}px": f"row_error_{part}px"
-        for part in (
-            "",
-            "mean_",
-            "spread_",
-            "rms_",
-            "median_",
-            "95_",
-            "before_",
-            "after_",
-            "held_out_",
-        )
-    },
+    **{f"epipolar_error_{part}px": f"row_error_{part}px" for part in _OF_ERRORS},
     **{
         f"{name}ratio": f"{name}share"
-        for name in (
-            "",
-            "valid_",
-            "swapped_",
-            "tilted_",
-            "calibration_",
-            "matching_",
-            "icp_",
-            "path_",
-        )
+        for name in ("", *["valid_", "swapped_", "tilted_", "calibration_", "matching_", "icp_"])
     },
     "grid_size": "occupancy_size",
 }
@@ -236,6 +224,16 @@ FORMER_KEYS: Final = {
 
 Before the dot is the group that a key is in; nothing = it is one of the whole.
 """
+
+
+def without_former_keys(value: Any, group: str = "") -> Any:
+    """Return what `with_former_keys` was given."""
+    if isinstance(value, list):
+        return [without_former_keys(item, group) for item in value]
+    if not isinstance(value, Mapping):
+        return value
+    former = {_former_key(group, key) for key in value}
+    return {k: without_former_keys(v, k) for k, v in value.items() if k not in former}
 
 
 def with_former_keys(value: Any, group: str = "") -> Any:
@@ -247,7 +245,11 @@ def with_former_keys(value: Any, group: str = "") -> Any:
     found: dict[str, Any] = {}
     for key, item in value.items():
         found[key] = with_former_keys(item, key)
-        former = FORMER_KEYS.get(f"{group}.{key}", FORMER_KEYS.get(key))
+        former = _former_key(group, key)
         if former is not None and former not in value:
             found[former] = found[key]
     return found
+
+
+def _former_key(group: str, key: str) -> str | None:
+    return FORMER_KEYS.get(f"{group}.{key}", FORMER_KEYS.get(key))

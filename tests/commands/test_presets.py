@@ -93,14 +93,21 @@ def test_old_names_are_read_with_one_line_that_names_the_new_ones(case):
 
 @pytest.mark.parametrize(("given", "words"), [
     ({"matching.sgm.p1": 20}, r"sgm\.p1' is a constant since 1\.0 \(got 20, expected 16"),
-    ({"matching.sad.ndisp": 64, "matching.ndisp": 32}, r"another value here \(got 64 and 32"),
     ({"matching.sad.fill": False, "matching.fine.fill": True}, r"another value.*ing\.fill alone"),
-    ({"ground.reach_m": 30, "occupancy.max_range_m": 25}, r"reach_m is occupancy\.max_range_m"),
 ])  # fmt: skip
 def test_old_values_that_there_are_no_more_are_refused_in_one_line(given, words):
     with pytest.raises(SettingsError, match=words) as refused:
         load_config(given)
     assert "\n" not in str(refused.value)
+
+
+def test_of_runs_that_have_the_old_and_the_new_name_the_new_one_counts_and_it_is_said():
+    old = {"robot.clearance_m": 1.5, "grid.max_height_m": 2.0, "ground.reach_m": 30}
+    old |= {"occupancy.max_range_m": 25, "matching.sad.ndisp": None, "cloud.stride": 1}
+    said = r"25 is used, not 30; .* 2\.0 is used, not 1\.5; .*and 1 more name"
+    with pytest.warns(FutureWarning, match=said):
+        config = load_config(old)
+    assert (config.grid.max_height_m, config.occupancy.max_range_m) == (2.0, 25.0)
 
 
 @pytest.mark.parametrize(("file", "options", "new"), [

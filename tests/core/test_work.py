@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from recon.commands.config import ReconConfig, load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
-from recon.core import machine as memory_file
 from recon.core import work as work_file
 from recon.core.errors import MemoryLimitError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.machine import available_cores, parse_size_mb, peak_memory_mb
 from recon.core.values import PointCloud, join_clouds, join_voxels
 from recon.core.work import OneBehind, look_ahead, side_by_side, use_threads
+from recon.map import settings as memory_file
 from recon.map.drive.mapper import SubmapBuilder
 from recon.map.ground.axes import AXES_MAP_WORLD
 from recon.map.settings import MemorySettings

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from recon.core.errors import FormatError
 from recon.core.progress import series, stage
+from recon.core.renamed import without_former_keys
 from recon.core.summary import Figures, inline, optional
 from recon.io.atomic import is_locked
 from recon.io.files import read_text, reading
@@ -161,7 +162,8 @@ def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
             outcome = replace(outcome, seconds=float(summary.get("seconds", 0.0)))
         warnings = tuple(map(str, summary.get("warnings", ())))
         remark = next(iter(warnings), "")
-        return JobResult(job, outcome, dict(_flat(summary)), warnings, remark, size)
+        figures = dict(_flat(without_former_keys(summary)))
+        return JobResult(job, outcome, figures, warnings, remark, size)
 
 
 def compare(results: Sequence[JobResult]) -> list[JobResult]:
