@@ -239,7 +239,7 @@ def run_audit(
         source: The recording.
         config: The configuration; its ``audit``, ``rectification`` and ``matching`` are used.
         quick: A short check of a second or two, as `recon map` makes it.
-        repair: File for the rig that rows and motion show, in the format that its name asks for
+        repair: File for the rig that features and motion show, in the format that its name asks for
             (`recon.rig.written`); None = none is written.
         out: Folder for a report with images; None = none is written.
 

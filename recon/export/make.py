@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -175,6 +176,9 @@ def write_product(context: ExportContext, name: str, path: Path) -> ExportResult
 def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:
     """Return the requested products, or the usual ones."""
     possible = OF_A_PAIR if pair else (*PRODUCTS,)
+    for former in FORMER_PRODUCTS.keys() & set(products):
+        note = f"--to {former} is --to {FORMER_PRODUCTS[former]} since 1.0"
+        warnings.warn(note, FutureWarning, stacklevel=2)
     products = [FORMER_PRODUCTS.get(product, product) for product in products]
     for product in products:
         if product not in possible:

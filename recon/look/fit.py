@@ -66,7 +66,7 @@ class FittedFault:
     time_offset_sigma: float = float("nan")
     spread: float = 1.0  # variance of what lenses bend, in that expected beforehand, 1 or more
     fixed: bool = True  # False: it turns with what is seen, as in stabilised images
-    # standard deviation of the path's length without the fault, as a share; NaN = as the covariance
+    # standard deviation of the path's length without the fault, as a ratio; NaN = as the covariance
     length: float = float("nan")
 
 
@@ -399,7 +399,7 @@ def _derivative(xyz: Float64, camera: RectifiedCamera) -> Float64:
 
 
 def disagreement(windows: Sequence[TrackWindow], camera: RectifiedCamera) -> float:
-    """Return the standard deviation of a path's length by halves of the features, as a share.
+    """Return the standard deviation of a path's length by halves of the features, as a ratio.
 
     That of the halves that disagree most: what is near is low, too, so that theirs do not add up.
     ``windows`` are seen with the rig of the path; those with too few features to be halved do not

@@ -169,7 +169,7 @@ class RefinedRig:
 
     @property
     def length_ratio(self) -> float | None:
-        """Standard deviation of the length of the path that is left to the rig used, as a share.
+        """Standard deviation of the length of the path that is left to the rig used, as a ratio.
 
         Without the baseline, unless lengths that were measured changed it; None if nothing was.
         """

@@ -45,7 +45,7 @@ _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 # Fraction of pixels with a measured disparity below which a pair is warned of: real ones, even of
 # bare walls, exceed 40 %. It is also warned of where more was inferred than measured.
 _FEW_MEASURED_RATIO: Final = 0.25
-# Findings with which rows and motion say nothing about the calibration.
+# Findings with which epipolar errors and motion say nothing about the calibration.
 _NOT_OF_THE_RIG: Final = frozenset(
     {"lag", "nonrigid", "stabilised", "swapped", "size", "frozen", "unreadable"}
 )
@@ -211,7 +211,7 @@ def audit_source(source: StereoSource, config: AuditedSettings, *, quick: bool =
 def correct_calibration(
     source: StereoSource, config: AuditedSettings, audit: Audit, path: Path
 ) -> CorrectedFigures:
-    """Write the calibration with which rows and motion agree, and return how it differs.
+    """Write the calibration with which epipolar errors and motion agree, and return how it differs.
 
     It is the one that `recon map` uses; of a drive that is too short for it, rows alone are
     aligned. The baseline stays. The name of the file tells its format; kalibr gets the nearest

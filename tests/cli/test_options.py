@@ -27,8 +27,10 @@ from recon.commands.config import (
 )
 from recon.core.errors import SettingsError
 from recon.core.settings import setting_names
+from recon.export.make import PRODUCTS
 from recon.map.localize.sequence import StartPose
 from recon.map.sessions.measured import Survey
+from recon.stereo.match.registry import MATCHERS
 from tests.docs.blocks import ROOT
 
 pytestmark = pytest.mark.portable
@@ -190,3 +192,9 @@ def test_settings_are_selected_by_name_and_shown_with_units_and_other_defaults()
     assert entry.values.endswith("or none")
     assert entry.default != entry.default_pair
     assert "(pair: none)" in settings("cloud.max_range_m").stdout
+
+
+def test_help_names_every_matcher_and_every_product():
+    for words, names in ((("pair",), MATCHERS), (("export",), PRODUCTS)):
+        shown = " ".join(re.sub(r"[│\n]", " ", help_of(*words)).split())
+        assert [name for name in names if not re.search(rf"\b{re.escape(name)}\b", shown)] == []
