@@ -193,7 +193,7 @@ def audit(
     repair: Annotated[
         Path | None,
         opt.option(
-            "Write the rig that features and motion show to this file: NAME.yaml is ours, NAME.yml, "
+            "Write the rig that features and motion show to a file: NAME.yaml is ours, NAME.yml, "
             ".xml or .json OpenCV's, camchain.yaml kalibr's, camera_info.yaml ROS's two files. "
             "Was --mend before 1.0.",
             "--repair",
