@@ -67,10 +67,10 @@ def posed(**entries: float) -> recon.OdometryResult:
         (posed(T00=-1.0), "no rigid pose"),  # a mirror
         (posed(T00=1.01), "no rigid pose.*1.01"),
         (posed(T30=1.0), "no rigid pose"),
-        (recon.OdometryResult(np.eye(4), None), "health of a pose.*None"),  # type: ignore[arg-type]
+        (recon.OdometryResult(np.eye(4), None), "invalid OdometryHealth.*None"),  # type: ignore[arg-type]
         (
             recon.OdometryResult(np.eye(4), recon.OdometryHealth(inliers="many")),  # type: ignore[arg-type]
-            "health of a pose.*many",
+            "invalid OdometryHealth.*many",
         ),
     ],
 )

@@ -276,4 +276,4 @@ def test_what_contradicts_odometry_or_itself_is_a_warning(closed):
     nothing = close_loops(drive, [])
     for times, warned in ((2, False), (3, True)):  # places where the drive cannot have been
         loops = DriveLoops(path, nothing, FRAMES, 0, {CONTRADICTED: times})
-        assert [("alike" in text) for text in loops.warnings()] == [True] * warned
+        assert [("aliasing" in text) for text in loops.warnings()] == [True] * warned

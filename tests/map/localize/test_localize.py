@@ -160,7 +160,7 @@ def test_after_a_jump_to_a_place_that_is_not_in_the_map_the_drive_coasts_and_is_
         == len(drive.placed) - len(drive.tracked)
     )
     coasting, lost_once = drive.warnings()
-    assert "by odometry alone" in coasting
+    assert "on odometry alone" in coasting
     assert "lost once" in lost_once
 
 

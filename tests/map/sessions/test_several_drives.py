@@ -392,7 +392,7 @@ def test_positions_far_from_the_path_are_warned_of(tmp_path):
 def test_positions_beyond_any_drift_are_refused(tmp_path, numbers):
     map_ = strayed(len(numbers))
     hold(map_, survey(tmp_path, winding(8.0, 0.02, numbers)))
-    with pytest.raises(RegistrationError, match="bend a path more than its drift explains"):
+    with pytest.raises(RegistrationError, match="deform a path more than its drift explains"):
         joining.join_new(map_, [])
 
 
