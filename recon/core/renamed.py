@@ -206,6 +206,7 @@ FORMER_KEYS: Final = {
         for key, former in (("epipolar_error_px", "rows_px"), ("right_time_offset", "right_late"))
     },
     "imu.time_offset_ms": "late_ms",
+    "imu.time_offset_sigma_ms": "late_sigma_ms",
     "loops.dense_ratio": "dense_share",
     ".segments": "drive_sessions",
     "time_offset_frames": "lag_frames",

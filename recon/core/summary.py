@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import shlex
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from importlib.util import find_spec
@@ -58,12 +59,12 @@ def named(key: str) -> Any:
     return field(metadata={_FORM: _LEFT_OUT, "key": key})
 
 
-class Summary(Figures):
+class Summary(Figures, ABC):
     """What a command found, as a whole."""
 
+    @abstractmethod
     def rows(self) -> Rows:
         """Return what the terminal says, at most eight lines."""
-        raise NotImplementedError
 
     def remarks(self) -> list[tuple[str, str]]:
         """Return kind and text of what the user should know, which stands apart."""

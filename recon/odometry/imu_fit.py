@@ -60,7 +60,7 @@ class ImuFit(Figures):
 
     origin: str = named("from")
     time_offset_ms: float
-    late_sigma_ms: float
+    time_offset_sigma_ms: float
     axes_off_deg: float | None
     axes_sigma_deg: float
     guide: GuideFigures = inline()
@@ -135,7 +135,7 @@ def fit_imu(
     found = ImuFit(
         origin=record.origin,
         time_offset_ms=1e3 * free.gyro.time_offset_s,
-        late_sigma_ms=free.sigma_ms,
+        time_offset_sigma_ms=free.sigma_ms,
         axes_off_deg=None if T_stated is None else free.axes_off_deg(T_stated),
         axes_sigma_deg=free.sigma_deg,
         guide=guide.figures(),

@@ -72,7 +72,7 @@ class Places:
         return np.asarray(near & before & (self.segments == place.segment))
 
     def around(self, number: int, T_place_camera: Float64, reach_m: float) -> list[int]:
-        """Return the places of a place's stretch in view of a camera beside it, nearest first."""
+        """Return the places of a place's segment in view of a camera beside it, nearest first."""
         T = invert(self.T_world_camera) @ self.T_world_camera[number] @ T_place_camera
         far_m = np.linalg.norm(T[:, :3, 3], axis=1)
         near = (far_m <= reach_m) & (angle_rad(T) <= np.deg2rad(VIEW_DEG))

@@ -173,7 +173,7 @@ def _between(map_: MapFile, group: Sequence[int], new: Session) -> list[Link]:
         other = map_.session(number)
         shared = shared_frames(other, new).tolist()
         ones, news = segment_numbers(other.health), segment_numbers(new.health)
-        # One for each two stretches: nothing else may say where those behind a lost pose are.
+        # One for each two segments: nothing else may say where those behind a lost pose are.
         both = [(int(ones[first]), int(news[last]), first, last) for first, last in shared]
         last = {
             (one, other): (first, last) for one, other, first, last in both if min(one, other) >= 0

@@ -354,7 +354,7 @@ class Keyframes:
             "keyframe": asdict(stored.keyframe),
             "T_world_camera": stored.T_world_camera,
             "path_m": stored.path_m,
-            "stretch": stored.segment,
+            "stretch": stored.segment,  # the name that it has in the format
             "loops": [asdict(loop) for loop in stored.loops],
             "refused": list(stored.refused),
         }
