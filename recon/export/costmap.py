@@ -16,7 +16,8 @@ from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.export.rasters import ground_slopes
 from recon.io.models.rasters import write_nav2_costs
-from recon.io.models.ros_bag import Message, header, pose, write_bag
+from recon.io.ros.bag import write_bag
+from recon.io.ros.messages import Message, header, pose
 from recon.map.ground.surface import GroundSurface, Raster
 from recon.map.ground.traverse import UNSURE, costs, judge, measure_relief, widened
 from recon.map.map import Map

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -11,14 +11,14 @@ import numpy as np
 
 from recon.core.errors import FormatError, ReconError
 from recon.core.geometry.se3 import invert, make_transform
-from recon.core.values import OccupancyGrid
 from recon.core.values.arrays import Float64, UInt8
 from recon.export.cloud import even_sample
 from recon.export.occupancy import Flattening
 from recon.export.product import DriveImages, ExportContext, ExportResult, ProductFigures
 from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
-from recon.io.models.ros_bag import Message, RosBag, header, points, pose, write_bag
+from recon.io.ros.bag import RosBag, write_bag
+from recon.io.ros.messages import grid_message, header, points, pose, transforms
 from recon.map.ground.axes import base_axes
 from recon.map.store.session import Session
 from recon.places.closure import USUAL, DrivePath
@@ -54,8 +54,8 @@ def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
     fixed += [edge for drive in drives for edge in drive.mounted()]
     start_ns, frames = min(drive.times_ns[0] for drive in drives), 0
     with write_bag(folder) as bag:
-        bag.write("/tf_static", start_ns, _transforms(start_ns, fixed), kept=True)
-        bag.write("/map/grid", start_ns, _grid(start_ns, grid), kept=True)
+        bag.write("/tf_static", start_ns, transforms(start_ns, fixed), kept=True)
+        bag.write("/map/grid", start_ns, grid_message(start_ns, grid), kept=True)
         cloud = points(header("map", start_ns), even_sample(context.placed.tiles))
         bag.write("/map/cloud", start_ns, cloud, kept=True)
         for drive in drives:
@@ -65,24 +65,6 @@ def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
     layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/", drives[0].name)
     write_text(folder / "foxglove.json", layout)
     return ExportResult(BagFigures(frames), warnings)
-
-
-def _transforms(time_ns: int, edges: Sequence[tuple[str, str, Float64]]) -> Message:
-    """Return where frames lie: parent, child, and ``T_parent_child`` of each."""
-    made = [
-        {"header": header(parent, time_ns), "child_frame_id": child,
-         "transform": pose(T, "translation", "rotation")}
-        for parent, child, T in edges
-    ]  # fmt: skip
-    return "tf2_msgs/msg/TFMessage", {"transforms": made}
-
-
-def _grid(time_ns: int, grid: OccupancyGrid) -> Message:
-    rows, columns = grid.cells.shape
-    corner = make_transform(np.eye(3), np.array([*grid.origin_m, 0.0]))
-    size = {"width": columns, "height": rows, "resolution": grid.resolution_m}
-    content = {"info": {**size, "origin": pose(corner)}, "data": grid.cells.ravel()}
-    return "nav_msgs/msg/OccupancyGrid", {"header": header("map", time_ns), **content}
 
 
 class _Drive:
@@ -117,7 +99,7 @@ class _Drive:
 
     def write(self, bag: RosBag, frame: int, views: tuple[UInt8, ...]) -> None:
         time_ns, T, base = self.times_ns[frame], self._T_map_base[frame], f"{self.name}base_link"
-        bag.write("/tf", time_ns, _transforms(time_ns, [("map", base, T)]))
+        bag.write("/tf", time_ns, transforms(time_ns, [("map", base, T)]))
         spread = np.diag(np.repeat(self._variance[frame], 3)).ravel()
         content = {
             "header": header("map", time_ns), "child_frame_id": base,

@@ -30,9 +30,7 @@ from recon.io.cameras.ros import (
 from recon.io.files import reading, refuse_special, resolved
 from recon.io.imu import imu_of
 from recon.io.positions import Positions, in_order, read_positions
-from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
-from recon.sources.images import find_partners, partner_names
-from recon.sources.rosbags import (
+from recon.io.ros.contents import (
     CAMERA_INFO,
     COMPRESSED,
     FIX,
@@ -40,10 +38,12 @@ from recon.sources.rosbags import (
     IMU,
     POSES,
     TRANSFORMS,
-    Bag,
     BagCameraInfo,
     BagPose,
 )
+from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
+from recon.sources.images import find_partners, partner_names
+from recon.sources.rosbags import Bag
 from recon.sources.settings import SourceSettings
 from recon.sources.source import ReadPrior, Recording, pair_frames
 from recon.sources.times import check_increasing, pair_stamps

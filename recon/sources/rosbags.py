@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,23 +20,16 @@ from numpy.typing import NDArray
 from recon.core.errors import FormatError, ReconError, require
 from recon.core.text import counted
 from recon.core.values.arrays import Float64, UInt8
-from recon.io.images.image import decode_image, pixels_of_ros_image
-
-IMAGE: Final = "sensor_msgs/msg/Image"
-COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
-FIX: Final = "sensor_msgs/msg/NavSatFix"
-IMU: Final = "sensor_msgs/msg/Imu"
-TRANSFORMS: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
-POSES: Final = (
-    "nav_msgs/msg/Odometry",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/TransformStamped",
-    *TRANSFORMS,
+from recon.io.ros.contents import (
+    TRANSFORMS,
+    BagCameraInfo,
+    BagPose,
+    camera_info_of,
+    image_of,
+    imu_row,
+    poses_of,
 )
-_EXTRA: Final = "ros"
-_NS_PER_S: Final = 1_000_000_000
+from recon.io.ros.messages import EXTRA, NS_PER_S
 
 
 class BagTopic(NamedTuple):
@@ -47,29 +40,6 @@ class BagTopic(NamedTuple):
     messages: int
 
 
-class BagCameraInfo(NamedTuple):
-    """``sensor_msgs/CameraInfo``: float64 D (N,), K (3, 3) raw, R (3, 3), P (3, 4) rectified."""
-
-    width_px: int
-    height_px: int
-    model: str
-    D: Float64
-    K: Float64
-    R: Float64
-    P: Float64
-
-
-class BagPose(NamedTuple):
-    """The pose of frame ``child`` (empty = the message does not say) in frame ``parent``."""
-
-    recorded_ns: int
-    stamp_ns: int  # of the header; 0 = none
-    parent: str
-    child: str
-    xyz_m: Float64
-    xyzw: Float64
-
-
 class Bag:
     """A recording: files of ROS 1 that belong together, or one folder or file of ROS 2."""
 
@@ -77,8 +47,8 @@ class Bag:
         self.paths = tuple(paths)
         self._ros1 = self.paths[0].suffix == ".bag"
         module = "rosbags.rosbag1" if self._ros1 else "rosbags.rosbag2"
-        self._reader = require(module, extra=_EXTRA).Reader
-        typesys = require("rosbags.typesys", extra=_EXTRA)
+        self._reader = require(module, extra=EXTRA).Reader
+        typesys = require("rosbags.typesys", extra=EXTRA)
         store = typesys.Stores.ROS1_NOETIC if self._ros1 else typesys.Stores.ROS2_HUMBLE
         self._store = typesys.get_typestore(store)
         for kind in TRANSFORMS:
@@ -117,16 +87,11 @@ class Bag:
                 raise FormatError("recording ends early", where=self.paths[0], got=got)
             position = target + 1
             where = f"{self.paths[0]}: {topic}, message {target}"
-            yield _decode(self._parse(found[2], topic), where)
+            yield image_of(self._parse(found[2], topic), where)
 
     def camera_info(self, topic: str) -> BagCameraInfo:
         for _, _, content in self._messages([topic]):
-            message = self._parse(content, topic)
-            # ROS 1 has upper-case field names.
-            names = "DKRP" if self._ros1 else "dkrp"
-            D, K, R, P = (np.array(getattr(message, name), np.float64) for name in names)
-            size, model = (int(message.width), int(message.height)), str(message.distortion_model)
-            return BagCameraInfo(*size, model, D, K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
+            return camera_info_of(self._parse(content, topic))
         raise FormatError("topic has no message", where=self.paths[0], got=topic)
 
     def frame_id(self, topic: str) -> str:
@@ -138,31 +103,13 @@ class Bag:
     def poses(self, topic: str) -> Iterator[BagPose]:
         """Yield the poses of a topic of one of the `POSES`, in the order of recording."""
         for _, recorded_ns, content in self._messages([topic]):
-            message = self._parse(content, topic)
-            for part in getattr(message, "transforms", [message]):
-                if hasattr(part, "transform"):
-                    place, turn = part.transform.translation, part.transform.rotation
-                else:
-                    pose = getattr(part.pose, "pose", part.pose)  # wrapped beside a covariance
-                    place, turn = pose.position, pose.orientation
-                stamp = part.header.stamp
-                yield BagPose(
-                    recorded_ns,
-                    int(stamp.sec) * _NS_PER_S + int(stamp.nanosec),
-                    # Old recordings write frames with a leading slash.
-                    str(part.header.frame_id).lstrip("/"),
-                    str(getattr(part, "child_frame_id", "")).lstrip("/"),
-                    np.array([place.x, place.y, place.z], dtype=np.float64),
-                    np.array([turn.x, turn.y, turn.z, turn.w], dtype=np.float64),
-                )
+            yield from poses_of(self._parse(content, topic), recorded_ns)
 
     def imu(self, topic: str) -> Float64:
         """Return rows (N, 8): times [ns] of recording and of the header, rates, forces."""
         rows = []
         for _, recorded_ns, content in self._messages([topic]):
-            message = self._parse(content, topic)
-            vectors = (message.angular_velocity, message.linear_acceleration)
-            values = [value for one in vectors for value in (one.x, one.y, one.z)]
+            values = imu_row(self._parse(content, topic))
             rows.append([recorded_ns, self._stamp_ns(content, topic), *values])
         return np.array(rows, np.float64).reshape(-1, 8)
 
@@ -226,7 +173,7 @@ class Bag:
         except (struct.error, IndexError) as error:
             got = f"{counted(len(content), 'byte')} on {topic}"
             raise FormatError("message is too short", where=self.paths[0], got=got) from error
-        return int(seconds) * _NS_PER_S + int(nanoseconds)
+        return int(seconds) * NS_PER_S + int(nanoseconds)
 
     @contextmanager
     def _opened(self) -> Iterator[list[Any]]:
@@ -245,11 +192,3 @@ class Bag:
             repair = "repair it with rosbag reindex, ros2 bag reindex or mcap recover"
             hint = f"it may be truncated; copy it again, or {repair}"
             raise FormatError(what, where=self.paths[0], got=got, hint=hint) from error
-
-
-def _decode(message: Any, where: str) -> UInt8:
-    if hasattr(message, "format"):
-        return decode_image(message.data.tobytes(), where)
-    shape, big_endian = (message.height, message.width), bool(message.is_bigendian)
-    how = message.encoding, shape, message.step
-    return pixels_of_ros_image(message.data, *how, big_endian=big_endian, where=where)

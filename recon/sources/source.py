@@ -29,6 +29,15 @@ class ReadPrior:
     origin: str
 
 
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """Where the left camera is on a robot, by the robot's own static transforms (REP 105)."""
+
+    T_base_camera: Float64  # (4, 4), of the camera as mounted, not of its rectified view
+    base: str = "base_link"  # name of the frame of the robot
+    camera: str = "left"  # name of the frame of the images
+
+
 @dataclass(frozen=True)
 class Latency(Figures):
     """Milliseconds from when an image was taken to its pose; None = there is no pose."""
@@ -159,6 +168,10 @@ class StereoSource(ABC):
 
     def read_imu(self) -> ImuRecord | None:
         """Read the inertial unit of the rig; None = there is none, `ReconError`: it is damaged."""
+        return None
+
+    def read_mount(self) -> Mount | None:
+        """Read where the camera is on the robot; None = nothing says so."""
         return None
 
     def occupancy_truth(

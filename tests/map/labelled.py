@@ -58,7 +58,7 @@ def main(folder: Path) -> None:
     from recon.io.models.columns import write_npz, write_pcd
     from recon.io.models.las import write_las
     from recon.io.models.ply import read_ply, write_ply
-    from recon.io.models.ros_bag import header, points
+    from recon.io.ros.messages import header, points
     from recon.map.map import Map
     from recon.map.sessions.copying import keep_map
     from recon.report.scene import COLOURINGS, Points, colours

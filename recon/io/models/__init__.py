@@ -1,1 +1,1 @@
-"""Point clouds (`columns.py`: what formats call attributes), meshes, COLMAP, bags of ROS 2."""
+"""Point clouds (`columns.py`: what formats call attributes), meshes, COLMAP, maps from above."""

@@ -52,7 +52,8 @@ from recon.io.models.rasters import (
     write_nav2,
     write_nav2_costs,
 )
-from recon.io.models.ros_bag import header, points, write_bag
+from recon.io.ros.bag import write_bag
+from recon.io.ros.messages import header, points
 from tests.scenery.octomaps import write_octomap
 
 NUMBERS = st.floats(-1e6, 1e6, width=32)
