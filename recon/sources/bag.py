@@ -6,50 +6,41 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.errors import CalibrationError, FormatError, SourceError
+from recon.core.errors import FormatError, SourceError
 from recon.core.geometry.se3 import invert, make_transform, rotation_from_quaternion
 from recon.core.text import counted
-from recon.core.values import CameraIntrinsics, ImuRecord, Rig, StereoPair, Trajectory, check_size
+from recon.core.values import ImuRecord, StereoPair, Trajectory, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
-from recon.io.cameras.kitti import projected_rig
 from recon.io.cameras.ros import (
     NS,
-    ROS_MODELS,
-    are_rectified,
-    lens_of,
-    rig_of_camera_infos,
-    step_between,
 )
-from recon.io.files import reading, refuse_special, resolved
+from recon.io.files import refuse_special, resolved
 from recon.io.imu import imu_of
 from recon.io.positions import Positions, in_order, read_positions
 from recon.io.ros.contents import (
     CAMERA_INFO,
-    COMPRESSED,
     FIX,
-    IMAGE,
     IMU,
     POSES,
     TRANSFORMS,
-    BagCameraInfo,
     BagPose,
 )
-from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
-from recon.sources.images import find_partners, partner_names
+from recon.sources.calibration import read_rig
+from recon.sources.images import find_partners
 from recon.sources.rosbags import Bag
 from recon.sources.settings import SourceSettings
 from recon.sources.source import ReadPrior, Recording, pair_frames
 from recon.sources.times import check_increasing, pair_stamps
+from recon.sources.topics import IMAGES, choose_topics, info_topics, list_topics, rig_of_infos
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
-_IMAGES: Final = (IMAGE, COMPRESSED)
 _LISTED: Final = 20  # most topics in a description
 
 
@@ -108,7 +99,7 @@ class BagSource(Recording):
 def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     """Open a recording, and read all its timestamps to pair the messages."""
     bag = Bag(recording_files(path))
-    topics, also = _choose_topics(bag, settings)
+    topics, also = choose_topics(bag.topics, settings, bag.paths[0])
     times = bag.scan(topics)
     stamps, clock = _stamps(times, topics, path)
     frames = pair_stamps(stamps[0], stamps[1], settings.tolerance_s, path)
@@ -120,7 +111,8 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         rig, texts = read_rig(settings, path, size)
         source = f"calibration {settings.calibration or 'in numbers'}"
     else:
-        (rig, note), texts = _rig_of_infos(bag, topics, path, size), ()
+        infos = [bag.camera_info(name) for name in info_topics(bag.topics, topics, path)]
+        (rig, note), texts = rig_of_infos(infos[0], infos[1], topics, path, size), ()
         source = "its CameraInfo" + (f" ({note})" if note else "")
     also += _list_others(bag, topics)
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
@@ -178,55 +170,9 @@ def _stamps(
     return (left, right), "" if stamped else ", recording times as the headers have none"
 
 
-def _rig_of_infos(
-    bag: Bag, topics: tuple[str, str], path: Path, size: tuple[int, int]
-) -> tuple[Rig, str]:
-    """Return the rig of the CameraInfo of images (width, height), and a note on it or none."""
-    names = [name for name in (_info_topic(bag, topic) for topic in topics) if name is not None]
-    if len(names) < 2:
-        what = "recording has no calibration of both cameras"
-        got = bag.list_topics((CAMERA_INFO,)) or "no CameraInfo"
-        raise SourceError(what, where=path, got=got, hint=CALIBRATE)
-    left, right = (bag.camera_info(name) for name in names)
-    stated, rectified = (left.width_px, left.height_px), all(map(_is_rectified, topics))
-    other = are_rectified((left.K, right.K), (left.P, right.P), stated, size)
-    if other or 0 in stated:
-        left, right = (one._replace(width_px=size[0], height_px=size[1]) for one in (left, right))
-    note = (
-        f"K and D of the CameraInfo are not of these images of {size[0]}x{size[1]} pixels, "
-        "and P is: they are taken as rectified"
-    )
-    rig = as_rectified(rig_of_messages(left, right, path, rectified or other))
-    return rig, note if other and not rectified else ""
-
-
-def _choose_topics(bag: Bag, settings: SourceSettings) -> tuple[tuple[str, str], str]:
-    """Return both topics by the settings, else the best pair by name, and a note on others."""
-    if settings.left or settings.right:
-        return _named(bag, settings), ""
-    images = [
-        topic.name
-        for topic in bag.topics.values()
-        if topic.kind in _IMAGES and topic.messages and "depth" not in topic.name.lower()
-    ]
-    ranked = sorted(
-        (not _is_rectified(left), bag.topics[left].kind == COMPRESSED, left, right)
-        for left, right in find_partners(images)
-        if bag.topics[left].kind == bag.topics[right].kind
-    )
-    if not ranked:
-        what = "recording has no image topics of a left and a right camera"
-        got = bag.list_topics(_IMAGES) or "no image topic"
-        hint = "name them with --left and --right"
-        raise SourceError(what, where=bag.paths[0], got=got, hint=hint)
-    best, *others = [(left, right) for *_, left, right in ranked]
-    also = ", ".join(left for left, _ in others)
-    return best, f" (also there: {also}; choose with --left)" if also else ""
-
-
 def _list_others(bag: Bag, used: Sequence[str]) -> str:
     """Return a note on other topics than those of images, and on which `--prior` takes."""
-    images = [name for name, topic in bag.topics.items() if topic.kind in _IMAGES]
+    images = [name for name, topic in bag.topics.items() if topic.kind in IMAGES]
     named = {*used, find_imu(bag), *(name for pair in find_partners(images) for name in pair)}
     unused = {name for name, topic in bag.topics.items() if topic.kind != CAMERA_INFO} - named
     others = sorted(unused)
@@ -235,58 +181,6 @@ def _list_others(bag: Bag, used: Sequence[str]) -> str:
     poses = [name for name in others if bag.topics[name].kind in POSES and "static" not in name]
     listed = ", ".join(others[:_LISTED]) + (" …" if len(others) > _LISTED else "")
     return f", other topics: {listed}" + (f" (for --prior: {', '.join(poses)})" if poses else "")
-
-
-def _info_topic(bag: Bag, image_topic: str) -> str | None:
-    """Return the CameraInfo topic of an image topic: at the same level, or one level up."""
-    place = PurePosixPath(image_topic.removesuffix("/compressed")).parent
-    for candidate in (place / "camera_info", place.parent / "camera_info"):
-        topic = bag.topics.get(str(candidate))
-        if topic is not None and topic.kind == CAMERA_INFO and topic.messages:
-            return topic.name
-    return None
-
-
-def _is_rectified(image_topic: str) -> bool:
-    return "rect" in image_topic.removesuffix("/compressed").rsplit("/", 1)[-1]
-
-
-def _named(bag: Bag, settings: SourceSettings) -> tuple[str, str]:
-    left, right = settings.left, settings.right
-    if right is None and left is not None:
-        right = next((name for name in partner_names(left) if name in bag.topics), None)
-    if left is None:
-        left = next((one for one, other in find_partners(bag.topics) if other == right), None)
-    for name in (left, right):
-        if name is None or name not in bag.topics or bag.topics[name].kind not in _IMAGES:
-            what = "recording has no such image topic"
-            got, expected = name or "one name alone", bag.list_topics(_IMAGES) or "an image topic"
-            raise SourceError(what, where=bag.paths[0], got=got, expected=expected)
-    return str(left), str(right)
-
-
-def rig_of_messages(left: BagCameraInfo, right: BagCameraInfo, where: Path, rectified: bool) -> Rig:
-    """Return the rig of two CameraInfo messages; of rectified images only ``P`` is used."""
-    for info in (left, right):
-        if not info.P[0, 0] > 0 or not info.K[0, 0] > 0:
-            what = "CameraInfo is of a camera that is not calibrated"
-            got, hint = f"focal length {info.P[0, 0]:g} px", "name a calibration file with --calib"
-            raise CalibrationError(what, where=where, got=got, hint=hint)
-    if not rectified:
-        cameras = [(_camera(info, where), info.R) for info in (left, right)]
-        return rig_of_camera_infos(cameras[0], cameras[1], (left.P, right.P), where)
-    step_between((left.P, right.P), where)
-    named = {"P of the left": left.P, "P of the right": right.P}
-    with reading(where):
-        return projected_rig(named, left.width_px, left.height_px)
-
-
-def _camera(info: BagCameraInfo, where: Path) -> CameraIntrinsics:
-    # Drivers of rectified images may leave the model empty.
-    name = info.model or "plumb_bob"
-    model, distortion = lens_of(ROS_MODELS, name, np.asarray(info.D), where)
-    with reading(where):
-        return CameraIntrinsics(info.K, distortion, info.width_px, info.height_px, model)
 
 
 _STATIC: Final = "tf_static"
@@ -298,7 +192,7 @@ def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadP
     where = f"{bag.paths[0]}: {name}"
     if name not in bag.topics or bag.topics[name].kind not in POSES:
         what = "recording has no such topic of poses, and there is no such file"
-        expected = bag.list_topics(POSES) or "a file; the recording has no poses"
+        expected = list_topics(bag.topics, POSES) or "a file; the recording has no poses"
         raise SourceError(what, where=bag.paths[0], got=name, expected=expected)
     (parent, child), poses = _choose_frames(list(bag.poses(name)), where)
     stamps = [pose.stamp_ns if stamped else pose.recorded_ns for pose in poses]
@@ -321,7 +215,7 @@ def find_imu(bag: Bag) -> str | None:
     """Return the topic of an inertial unit; of several, one of all that it measures."""
     found = [topic for topic in bag.topics.values() if topic.kind == IMU and topic.messages]
     ranked = sorted(found, key=lambda topic: ("accel" in topic.name, "imu" not in topic.name,
-                                              -topic.messages, topic.name))  # fmt: skip
+                                              -(topic.messages or 0), topic.name))  # fmt: skip
     return ranked[0].name if ranked else None
 
 
@@ -394,7 +288,8 @@ def read_measured(path: Path) -> Positions:
     chosen = [f"/{topic}"] if topic else known
     if len(chosen) != 1 or chosen[0] not in known:
         what = "several receivers" if len(chosen) > 1 else "no positions of a receiver"
-        got = bag.list_topics((FIX,)) or "no NavSatFix among " + (", ".join(bag.topics) or "none")
+        none = f"no NavSatFix among {', '.join(bag.topics) or 'none'}"
+        got = list_topics(bag.topics, (FIX,)) or none
         hint = f"name one: {place}:{known[0]}" if known else None
         raise SourceError(f"the recording has {what}", where=path, got=got, hint=hint)
     table = bag.fixes(chosen[0])

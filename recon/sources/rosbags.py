@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +30,7 @@ from recon.io.ros.contents import (
     poses_of,
 )
 from recon.io.ros.messages import EXTRA, NS_PER_S
-
-
-class BagTopic(NamedTuple):
-    """A topic: its name, message type and number of messages."""
-
-    name: str
-    kind: str
-    messages: int
+from recon.sources.topics import Topic
 
 
 class Bag:
@@ -56,13 +49,6 @@ class Bag:
                 fields = "geometry_msgs/TransformStamped[] transforms\n"
                 self._store.register(typesys.get_types_from_msg(fields, kind))
         self.topics = self._find_topics()
-
-    def list_topics(self, kinds: Sequence[str]) -> str:
-        return ", ".join(
-            f"{topic.name} ({topic.messages})"
-            for topic in sorted(self.topics.values(), key=lambda topic: topic.name)
-            if topic.kind in kinds
-        )
 
     def scan(self, topics: Sequence[str]) -> dict[str, NDArray[np.int64]]:
         """Return of each topic int64 (N, 2), ns: time of recording, in order, and header stamp."""
@@ -130,13 +116,13 @@ class Bag:
             rows.append([recorded_ns, self._stamp_ns(content, topic), status, *place, *sigma])
         return np.array(rows, np.float64).reshape(-1, 9)
 
-    def _find_topics(self) -> dict[str, BagTopic]:
-        found: dict[str, BagTopic] = {}
+    def _find_topics(self) -> dict[str, Topic]:
+        found: dict[str, Topic] = {}
         with self._our_errors(), self._opened() as readers:
             for connection in (c for reader in readers for c in reader.connections):
                 name, kind = connection.topic, connection.msgtype
-                before = found[name].messages if name in found else 0
-                found[name] = BagTopic(name, kind, before + connection.msgcount)
+                before = found[name].messages or 0 if name in found else 0
+                found[name] = Topic(name, kind, before + connection.msgcount)
         return found
 
     def _messages(

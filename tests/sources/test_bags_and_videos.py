@@ -11,10 +11,11 @@ from recon.core.errors import ReconError, SourceError
 from recon.core.geometry.se3 import exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera, StereoCalibration
 from recon.io.ros.contents import BagCameraInfo
-from recon.sources.bag import read_measured, rig_of_messages
+from recon.sources.bag import read_measured
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
 from recon.sources.source import StereoSource
+from recon.sources.topics import rig_of_messages
 from recon.sources.video import VideoFile, view_size
 from tests.sources import drives
 from tests.sources.bags import TOPICS, Recording, bag, recorder

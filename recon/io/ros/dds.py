@@ -1,0 +1,263 @@
+"""Messages on a network as nodes of ROS 2 exchange them, by Cyclone DDS (extra ``ros2``), no ROS.
+
+A topic ``/a`` is ``rt/a`` on the wire, a type ``p/msg/T`` is ``p::msg::dds_::T_``. Cyclone checks
+what is sent and received against these types; their bytes are made and read by rosbags.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+from recon.core.errors import FormatError, SettingsError, SourceError, require
+from recon.core.text import counted
+from recon.io.ros.messages import Message, encode, message_types
+
+EXTRA: Final = "ros2"
+DOMAIN: Final = "ROS_DOMAIN_ID"
+_RANGE: Final = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+_CYCLONE: Final = "CYCLONEDDS_URI"
+_MOST_DOMAIN: Final = 232  # beyond which DDS has no ports
+_PREFIX: Final = "rt"
+_DEPTH: Final = 10  # messages that may wait to be taken, or sent again to who missed one
+_WAKE_S: Final = 0.1
+# As rmw_cyclonedds has it for nodes of one machine; without multicast, others are found by port.
+_LOOPBACK: Final = """<CycloneDDS><Domain><General>
+<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+<AllowMulticast>false</AllowMulticast><MaxMessageSize>65500B</MaxMessageSize></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+_BASE: Final = {
+    "byte": "uint8",
+    "octet": "uint8",
+    "char": "uint8",
+    "string": "str",
+    "wstring": "str",
+}
+
+
+class NetworkTopic(NamedTuple):
+    """A topic that somebody publishes."""
+
+    name: str
+    kind: str  # such as sensor_msgs/msg/Image
+    publishers: int
+    reliable: bool  # whether all of them send again what was lost
+    kept: bool  # whether all of them give the last messages to who subscribes late
+
+
+@dataclass(frozen=True, eq=False)
+class Received:
+    """A message that arrived, by `time.monotonic`; ``content`` is its CDR."""
+
+    topic: str
+    kind: str
+    content: bytes
+    arrived_s: float
+
+    def parse(self) -> Any:
+        """Return the message, as rosbags reads it; one that cannot be read is a `FormatError`."""
+        try:
+            return message_types().deserialize_cdr(self.content, self.kind)
+        except Exception as error:
+            got = f"{counted(len(self.content), 'byte')}: {error or type(error).__name__}"
+            raise FormatError("message cannot be read", where=self.topic, got=got) from error
+
+
+def domain_of(environment: Mapping[str, str] = os.environ) -> int:
+    """Return the domain of ROS 2 that the environment names; 0 = it names none."""
+    text = environment.get(DOMAIN, "").strip() or "0"
+    if not (text.isascii() and text.isdecimal() and int(text) <= _MOST_DOMAIN):
+        expected = f"a number from 0 to {_MOST_DOMAIN}"
+        raise SettingsError("not a domain of ROS 2", where=DOMAIN, got=text, expected=expected)
+    return int(text)
+
+
+def configuration_of(environment: Mapping[str, str] = os.environ) -> tuple[str | None, str]:
+    """Return the configuration of Cyclone, None = its own; and who is talked to, in words.
+
+    Nobody outside this machine, unless the environment asks for it as ROS 2 does, or has a
+    configuration of Cyclone.
+    """
+    if environment.get(_CYCLONE):
+        return None, f"as {_CYCLONE} says"
+    asked = environment.get(_RANGE, "").strip().upper() or "LOCALHOST"
+    if asked == "SUBNET":
+        return None, f"the local network, as {_RANGE} says"
+    if asked != "LOCALHOST":
+        expected = f"LOCALHOST or SUBNET; {_CYCLONE} can name peers and interfaces"
+        raise SettingsError("not a range of discovery", where=_RANGE, got=asked, expected=expected)
+    return _LOOPBACK, f"this machine alone ({_RANGE}=SUBNET for the local network)"
+
+
+class Network:
+    """A participant in a domain of ROS 2, until it is closed."""
+
+    def __init__(self, domain: int | None = None, configuration: str | None = None) -> None:
+        names = ("domain", "core", "builtin", "topic", "pub", "sub", "util")
+        self._dds = {name: require(f"cyclonedds.{name}", extra=EXTRA) for name in names}
+        self.domain = domain_of() if domain is None else domain
+        own, self.reach = configuration_of()
+        with self._our_errors("the network cannot be joined"):
+            self._domain = _domain(self.domain, configuration or own or "")
+            self._participant = self._dds["domain"].DomainParticipant(self.domain)
+            kinds = self._dds["builtin"].BuiltinTopicDcpsPublication
+            self._endpoints = self._dds["builtin"].BuiltinDataReader(self._participant, kinds)
+        self._readers: list[_Reader] = []
+        self._writers: dict[str, Any] = {}
+        self._lock = threading.Lock()  # topics are written by several threads
+        self._waiting = self._dds["core"].WaitSet(self._participant)
+
+    def topics(self) -> dict[str, NetworkTopic]:
+        """Return what others publish, as far as it is known by now: a second, or two, after."""
+        with self._our_errors("the network cannot be read"):
+            found = self._endpoints.read(1000)
+        of, topics = self._dds["core"].Policy, dict[str, NetworkTopic]()
+        for end in found:
+            kind = _kind_of(str(getattr(end, "type_name", "")))
+            if kind is None or not end.topic_name.startswith(f"{_PREFIX}/"):
+                continue
+            if str(end.participant_key) == str(self._participant.guid):
+                continue
+            name, qos = end.topic_name[len(_PREFIX) :], list(end.qos)
+            reliable = any(isinstance(one, of.Reliability.Reliable) for one in qos)
+            kept = of.Durability.Volatile not in qos
+            if (before := topics.get(name)) is not None:
+                reliable, kept = reliable and before.reliable, kept and before.kept
+            count = 1 if before is None else before.publishers + 1
+            topics[name] = NetworkTopic(name, kind, count, reliable, kept)
+        return topics
+
+    def subscribe(self, name: str, kind: str, *, reliable: bool, kept: bool) -> None:
+        """Take the messages of a topic from now on; ``kept`` = also the last ones before."""
+        with self._our_errors(f"{name} cannot be subscribed to"):
+            quality = self._quality(reliable=reliable, kept=kept, depth=_DEPTH)
+            topic = self._topic(name, kind)
+            reader = self._dds["sub"].DataReader(self._participant, topic, quality)
+            core = self._dds["core"]
+            new = core.ViewState.Any | core.InstanceState.Alive | core.SampleState.NotRead
+            condition = core.ReadCondition(reader, new)
+            self._waiting.attach(condition)
+            self._readers.append(_Reader(name, kind, reader, condition))
+
+    def receive(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[list[Received]]:
+        """Yield what arrived, at least ten times a second, if only nothing; until stopped."""
+        wait = self._dds["util"].duration(seconds=_WAKE_S)
+        while not stopped():
+            with self._our_errors("the network cannot be read"):
+                self._waiting.wait(wait)
+                now_s, found = time.monotonic(), list[Received]()
+                for one in self._readers:
+                    taken = one.reader.take(_DEPTH, condition=one.condition)
+                    contents = [bytes(sample.content) for sample in taken if _is_whole(sample)]
+                    found += [Received(one.topic, one.kind, each, now_s) for each in contents]
+            yield found
+
+    def write(self, topic: str, time_ns: int, message: Message, *, kept: bool = False) -> None:
+        """Publish a message; ``kept`` = who subscribes late gets the last one of the topic, too."""
+        del time_ns  # of the header; on the wire is the time of sending
+        kind, content = message[0], encode(message)
+        with self._lock, self._our_errors(f"{topic} cannot be published"):
+            if topic not in self._writers:
+                quality = self._quality(reliable=True, kept=kept, depth=1 if kept else _DEPTH)
+                publish = self._dds["pub"].DataWriter
+                self._writers[topic] = publish(self._participant, self._topic(topic, kind), quality)
+            self._writers[topic].write(_type_of(kind)(content))
+
+    def close(self) -> None:
+        """Leave the network. What is kept is gone then, as with any node of ROS 2."""
+        with self._lock:
+            self._waiting = self._endpoints = None
+            self._readers.clear()
+            self._writers.clear()
+            self._participant = self._domain = None
+
+    def _topic(self, name: str, kind: str) -> Any:
+        return self._dds["topic"].Topic(self._participant, f"{_PREFIX}{name}", _type_of(kind))
+
+    def _quality(self, *, reliable: bool, kept: bool, depth: int) -> Any:
+        of, core = self._dds["core"].Policy, self._dds["core"]
+        block = self._dds["util"].duration(milliseconds=100)
+        return core.Qos(
+            of.Reliability.Reliable(block) if reliable else of.Reliability.BestEffort,
+            of.Durability.TransientLocal if kept else of.Durability.Volatile,
+            of.History.KeepLast(depth),
+            of.DataRepresentation(use_cdrv0_representation=True),
+            # Members have other names in the types of ROS 2 that are sent along.
+            of.TypeConsistency.AllowTypeCoercion(ignore_member_names=True),
+        )
+
+    @contextmanager
+    def _our_errors(self, what: str) -> Iterator[None]:
+        try:
+            yield
+        except self._dds["core"].DDSException as error:
+            where, got = f"domain {self.domain}", str(error)
+            raise SourceError(what, where=where, got=got, hint=f"see {_CYCLONE}") from error
+
+
+class _Reader(NamedTuple):
+    topic: str
+    kind: str
+    reader: Any
+    condition: Any
+
+
+@cache
+def _domain(number: int, configuration: str) -> Any:
+    """Begin a domain, once in a process, as Cyclone has it; "" = as the environment says."""
+    return require("cyclonedds.domain", extra=EXTRA).Domain(number, configuration or None)
+
+
+def _is_whole(sample: Any) -> bool:
+    return isinstance(getattr(sample, "content", None), bytes)
+
+
+def _kind_of(type_name: str) -> str | None:
+    """Return the type of a message by its name on the wire, if we know it."""
+    package, _, name = type_name.removesuffix("_").partition("::msg::dds_::")
+    kind = f"{package}/msg/{name}"
+    return kind if kind in message_types().fielddefs else None
+
+
+@cache
+def _type_of(kind: str) -> Any:
+    """Return a type of Cyclone for messages of ROS, whose bytes stay as they are."""
+    made = _described(kind)
+
+    def begin(self: Any, content: bytes) -> None:
+        self.content = content
+
+    made.__init__ = begin
+    made.serialize = lambda self, *_, **__: self.content
+    made.deserialize = classmethod(lambda of, data, *_, **__: of(data))
+    return made
+
+
+@cache
+def _described(kind: str) -> Any:
+    """Return the description of a message, which Cyclone checks bytes against."""
+    package, name = kind.split("/msg/")
+    fields = {field: _field(of) for field, of in message_types().fielddefs[kind][1]}
+    idl = require("cyclonedds.idl", extra=EXTRA)
+    return idl.make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", fields)
+
+
+def _field(definition: Any) -> Any:
+    types = require("cyclonedds.idl.types", extra=EXTRA)
+    node, of = definition
+    name = node.name
+    if name == "NAME":
+        return _described(of)
+    if name == "BASE":
+        base = _BASE.get(of[0], of[0])
+        return {"str": str, "bool": bool}.get(base) or getattr(types, base)
+    inner = _field(of[0])
+    return types.array[inner, of[1]] if name == "ARRAY" else types.sequence[inner]
