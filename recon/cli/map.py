@@ -236,8 +236,9 @@ def live(
     source: Annotated[
         str,
         typer.Argument(
-            help="Left camera (0, /dev/video0, address of a stream) or one that has both views; or "
-            "a recording. " + opt.SOURCES_HELP
+            help="Left camera (0, /dev/video0, address of a stream) or one that has both views; "
+            "topics of ROS 2 (ros2:/left/image_raw,/right/image_raw); or a recording. "
+            + opt.SOURCES_HELP
         ),
     ],
     right_camera: Annotated[
@@ -280,6 +281,7 @@ def live(
         from recon.cli.progress import announce
         from recon.commands.localize import run_live
         from recon.rig.capture import is_camera, open_camera_source
+        from recon.sources.ros2 import ADDRESS, open_ros2
 
         stopped = stack.enter_context(until_interrupted())
         pose, _ = read_start(start)
@@ -288,7 +290,13 @@ def live(
             "live", out, view=view, mesh=mesh, source=source, kind=reading.kind
         )
         drive: StereoSource
-        if right_camera is not None or is_camera(source):
+        if source.startswith(ADDRESS):
+            if right_camera is not None:
+                raise typer.BadParameter(f"both topics are one argument: {ADDRESS}/left,/right")
+            network = open_ros2(source, settings.source, stopped=stopped)
+            drive = stack.enter_context(network)
+            announce(drive, quiet=shared.quiet, verbose=shared.verbose)
+        elif right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]
             cameras = open_camera_source(devices, settings.capture, settings.source, stopped)
             drive = stack.enter_context(cameras)

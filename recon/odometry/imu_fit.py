@@ -36,16 +36,16 @@ from recon.odometry.imu import (
 _LAGS_S: Final = np.linspace(-0.5, 0.5, 101)  # delays that are tried first
 _ROUNDS: Final = 15  # steps of the fit
 _DONE: Final = 1e-7  # size of a step that is the last
-_LEAST_TURNS: Final = 8  # fewer say too little of seven unknowns
+LEAST_TURNS: Final = 8  # fewer say too little of seven unknowns
 _DOUBTED: Final = 3.0  # standard deviations at which a turn counts half
 _MEDIAN: Final = 1.538  # median length of an error in space, in standard deviations along an axis
-_NOISE: Final = 2e-3  # rad per square root of a second, to begin with
+NOISE: Final = 2e-3  # rad per square root of a second, to begin with
 _BIAS: Final = 0.1  # rad/s, standard deviation of a bias before anything is seen
 _TURN: Final = float(np.deg2rad(1.0))
 _TIME_OFFSET_S: Final = 5e-3
 """Standard deviations of axes and stamps as they are stated, since boards bend and exposures last;
 also those up to which what is found may take their place."""
-_STATED: Final = np.array([_TURN] * 3 + [_BIAS] * 3 + [_TIME_OFFSET_S])
+STATED: Final = np.array([_TURN] * 3 + [_BIAS] * 3 + [_TIME_OFFSET_S])
 _MIRRORED: Final = "its axes are left-handed"
 _IN_DEGREES: Final = "its rates are in degrees per second"
 _CONTRADICTED: Final = 2.0  # how much better a faulty file explains turns than a right one would
@@ -108,8 +108,8 @@ def fit_imu(
         return FittedImu(None, notes)
     runs = see()
     turns = _turns_of(runs, record)
-    if len(turns) < _LEAST_TURNS:
-        seen = f"{len(turns)} of at least {_LEAST_TURNS} motions"
+    if len(turns) < LEAST_TURNS:
+        seen = f"{len(turns)} of at least {LEAST_TURNS} motions"
         return _unused("the cameras see too little to know its bias by", seen, notes)
     free = _free_fit(record, turns, T_stated)
     turned = float(np.sqrt(np.mean([angle_rad(turn.R) ** 2 for turn in turns])))
@@ -252,7 +252,7 @@ def _aligned(record: ImuRecord, turns: Sequence[_Turn]) -> Gyro:
     lasting = np.array([turn.to_s - turn.from_s for turn in turns])
     seen = np.stack([log_so3(turn.R) for turn in turns]) / lasting[:, None]
     measured = np.stack([_at_offsets(record, turn) for turn in turns]) / lasting[:, None, None]
-    sigma = np.hypot([turn.sigma for turn in turns], _NOISE * np.sqrt(lasting)) / lasting
+    sigma = np.hypot([turn.sigma for turn in turns], NOISE * np.sqrt(lasting)) / lasting
     weight = 1.0 / (sigma**2 + (0.1 * _BIAS) ** 2)
     weight /= weight.sum()
     mean_seen, means = weight @ seen, np.einsum("n,nlk->lk", weight, measured)
@@ -283,9 +283,9 @@ def _at_offsets(record: ImuRecord, turn: _Turn) -> Float64:
 
 def _fitted(gyro: Gyro, turns: Sequence[_Turn], stated: Gyro | None = None) -> _Fit:
     """Return the gyro near to one that fits turns, perhaps with what is stated (Gauss-Newton)."""
-    noise, information = _NOISE, np.diag(1.0 / np.square([*[10.0] * 3, *[_BIAS] * 3, 10.0]))
+    noise, information = NOISE, np.diag(1.0 / np.square([*[10.0] * 3, *[_BIAS] * 3, 10.0]))
     if stated is not None:
-        information = np.diag(1.0 / _STATED**2)
+        information = np.diag(1.0 / STATED**2)
     for _ in range(_ROUNDS):
         H, g = information.copy(), np.zeros(7)
         if stated is not None:

@@ -27,7 +27,6 @@ from recon.io.positions import Positions, in_order, read_positions
 from recon.io.ros.contents import (
     CAMERA_INFO,
     FIX,
-    IMU,
     POSES,
     TRANSFORMS,
     BagPose,
@@ -38,7 +37,14 @@ from recon.sources.rosbags import Bag
 from recon.sources.settings import SourceSettings
 from recon.sources.source import ReadPrior, Recording, pair_frames
 from recon.sources.times import check_increasing, pair_stamps
-from recon.sources.topics import IMAGES, choose_topics, info_topics, list_topics, rig_of_infos
+from recon.sources.topics import (
+    IMAGES,
+    choose_topics,
+    find_imu,
+    info_topics,
+    list_topics,
+    rig_of_infos,
+)
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
 _LISTED: Final = 20  # most topics in a description
@@ -73,7 +79,7 @@ class BagSource(Recording):
         return read_topic(self.bag, name, self.topics[0], stamped=self.stamped)
 
     def read_imu(self) -> ImuRecord | None:
-        name = find_imu(self.bag)
+        name = find_imu(self.bag.topics)
         if name is None:
             return None
         return read_imu_topic(self.bag, name, self.topics[0], stamped=self.stamped)
@@ -173,7 +179,11 @@ def _stamps(
 def _list_others(bag: Bag, used: Sequence[str]) -> str:
     """Return a note on other topics than those of images, and on which `--prior` takes."""
     images = [name for name, topic in bag.topics.items() if topic.kind in IMAGES]
-    named = {*used, find_imu(bag), *(name for pair in find_partners(images) for name in pair)}
+    named = {
+        *used,
+        find_imu(bag.topics),
+        *(name for pair in find_partners(images) for name in pair),
+    }
     unused = {name for name, topic in bag.topics.items() if topic.kind != CAMERA_INFO} - named
     others = sorted(unused)
     if not others:
@@ -209,14 +219,6 @@ def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadP
         return ReadPrior(path, f"{origin}, no static transform to {camera or 'the camera'}")
     moved = Trajectory(path.T_world_camera @ T_child_camera, path.timestamps_s)
     return ReadPrior(moved, f"{origin}, moved to {camera} by the static transforms")
-
-
-def find_imu(bag: Bag) -> str | None:
-    """Return the topic of an inertial unit; of several, one of all that it measures."""
-    found = [topic for topic in bag.topics.values() if topic.kind == IMU and topic.messages]
-    ranked = sorted(found, key=lambda topic: ("accel" in topic.name, "imu" not in topic.name,
-                                              -(topic.messages or 0), topic.name))  # fmt: skip
-    return ranked[0].name if ranked else None
 
 
 def read_imu_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ImuRecord:

@@ -14,10 +14,17 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.text import counted, is_count
-from recon.core.values import Recorded
+from recon.core.values import ImuRecord, Recorded, Trajectory
 from recon.core.values.arrays import UInt8
 from recon.io.images.image import silent_opencv
-from recon.sources.source import DerivedSource, Latency, LiveFigures, SourceFigures, StereoSource
+from recon.sources.source import (
+    DerivedSource,
+    Latency,
+    LiveFigures,
+    Mount,
+    SourceFigures,
+    StereoSource,
+)
 
 # Pairs that may wait; where another comes, the oldest is dropped. With one, a slow consumer always
 # gets the newest pair, and what is dropped is spread evenly.
@@ -65,6 +72,15 @@ class LiveSource(DerivedSource):
         finally:
             self._ended = True
 
+    def read_mount(self) -> Mount | None:
+        return self.source.read_mount()
+
+    def read_imu(self) -> ImuRecord | None:
+        return self.source.read_imu() if self.source.live else None
+
+    def recent_path(self) -> Trajectory | None:
+        return self.source.recent_path()
+
     def hurried(self) -> bool:
         return bool(self._waiting)
 
@@ -90,7 +106,7 @@ class LiveSource(DerivedSource):
         return SourceFigures(live=live)
 
     def warnings(self) -> list[str]:
-        lines = []
+        lines = self.source.warnings() if self.source.live else []
         if self._unmatched:
             what = "tracked but not matched, so their points are not in the map"
             lines.append(f"{counted(self._unmatched, 'frame')} arrived too fast, {what}")
@@ -103,7 +119,7 @@ class LiveSource(DerivedSource):
         try:
             for pair in self.source.frames(start):
                 first_s = pair.timestamp_s if first_s is None else first_s
-                due_s = pair.timestamp_s
+                due_s = self.source.due_s(pair)
                 if self.rate is not None:
                     due_s = begun_s + (pair.timestamp_s - first_s) / self.rate
                 time.sleep(max(0.0, due_s - time.monotonic()))

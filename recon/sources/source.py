@@ -167,7 +167,17 @@ class StereoSource(ABC):
         return ReadPrior(read_tum(name), name)
 
     def read_imu(self) -> ImuRecord | None:
-        """Read the inertial unit of the rig; None = there is none, `ReconError`: it is damaged."""
+        """Read the inertial unit of the rig; None = there is none, `ReconError`: it is damaged.
+
+        That of a live source is what it measured in the last seconds.
+        """
+        return None
+
+    def recent_path(self) -> Trajectory | None:
+        """Return the path of the left camera in the last seconds by wheels; None = there are none.
+
+        Only live sources have one; that of a recording is a prior.
+        """
         return None
 
     def read_mount(self) -> Mount | None:
@@ -193,6 +203,10 @@ class StereoSource(ABC):
     def figures(self) -> SourceFigures:
         """Return the same as figures."""
         return SourceFigures()
+
+    def due_s(self, pair: Recorded) -> float:
+        """Return when the newest pair of a live source was there, by `time.monotonic`."""
+        return pair.timestamp_s
 
     def hurried(self) -> bool:
         """Return whether the next pair has arrived already, so that this one is late."""

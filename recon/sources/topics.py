@@ -19,7 +19,7 @@ from recon.io.cameras.ros import (
     step_between,
 )
 from recon.io.files import StrPath, reading
-from recon.io.ros.contents import CAMERA_INFO, COMPRESSED, IMAGE, BagCameraInfo
+from recon.io.ros.contents import CAMERA_INFO, COMPRESSED, IMAGE, IMU, BagCameraInfo
 from recon.sources.calibration import CALIBRATE, as_rectified
 from recon.sources.images import find_partners, partner_names
 from recon.sources.settings import SourceSettings
@@ -162,3 +162,11 @@ def _camera(info: BagCameraInfo, where: StrPath) -> CameraIntrinsics:
     model, distortion = lens_of(ROS_MODELS, name, np.asarray(info.D), where)
     with reading(where):
         return CameraIntrinsics(info.K, distortion, info.width_px, info.height_px, model)
+
+
+def find_imu(topics: Topics) -> str | None:
+    """Return the topic of an inertial unit; of several, one of all that it measures."""
+    found = [topic for topic in topics.values() if topic.kind == IMU and not topic.empty]
+    ranked = sorted(found, key=lambda topic: ("accel" in topic.name, "imu" not in topic.name,
+                                              -(topic.messages or 0), topic.name))  # fmt: skip
+    return ranked[0].name if ranked else None

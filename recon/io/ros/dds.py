@@ -25,7 +25,7 @@ _RANGE: Final = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _CYCLONE: Final = "CYCLONEDDS_URI"
 _MOST_DOMAIN: Final = 232  # beyond which DDS has no ports
 _PREFIX: Final = "rt"
-_DEPTH: Final = 10  # messages that may wait to be taken, or sent again to who missed one
+DEPTH: Final = 10  # messages that may wait to be taken, or sent again to who missed one
 _WAKE_S: Final = 0.1
 # As rmw_cyclonedds has it for nodes of one machine; without multicast, others are found by port.
 _LOOPBACK: Final = """<CycloneDDS><Domain><General>
@@ -48,9 +48,9 @@ class NetworkTopic(NamedTuple):
 
     name: str
     kind: str  # such as sensor_msgs/msg/Image
-    publishers: int
-    reliable: bool  # whether all of them send again what was lost
-    kept: bool  # whether all of them give the last messages to who subscribes late
+    reliable: bool = False  # whether all who publish it send again what was lost
+    kept: bool = False  # whether all of them give the last messages to who subscribes late
+    publishers: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +112,8 @@ class Network:
             self._endpoints = self._dds["builtin"].BuiltinDataReader(self._participant, kinds)
         self._readers: list[_Reader] = []
         self._writers: dict[str, Any] = {}
-        self._lock = threading.Lock()  # topics are written by several threads
+        self._writing, self._reading = threading.Lock(), threading.Lock()
+        self._closed = False
         self._waiting = self._dds["core"].WaitSet(self._participant)
 
     def topics(self) -> dict[str, NetworkTopic]:
@@ -132,30 +133,33 @@ class Network:
             if (before := topics.get(name)) is not None:
                 reliable, kept = reliable and before.reliable, kept and before.kept
             count = 1 if before is None else before.publishers + 1
-            topics[name] = NetworkTopic(name, kind, count, reliable, kept)
+            topics[name] = NetworkTopic(name, kind, reliable, kept, count)
         return topics
 
-    def subscribe(self, name: str, kind: str, *, reliable: bool, kept: bool) -> None:
-        """Take the messages of a topic from now on; ``kept`` = also the last ones before."""
+    def subscribe(self, wanted: NetworkTopic, depth: int = DEPTH) -> None:
+        """Take the messages of a topic from now on, as it is offered; ``depth`` may wait."""
+        name, kind = wanted.name, wanted.kind
         with self._our_errors(f"{name} cannot be subscribed to"):
-            quality = self._quality(reliable=reliable, kept=kept, depth=_DEPTH)
+            quality = self._quality(wanted.reliable, wanted.kept, depth)
             topic = self._topic(name, kind)
             reader = self._dds["sub"].DataReader(self._participant, topic, quality)
             core = self._dds["core"]
             new = core.ViewState.Any | core.InstanceState.Alive | core.SampleState.NotRead
             condition = core.ReadCondition(reader, new)
             self._waiting.attach(condition)
-            self._readers.append(_Reader(name, kind, reader, condition))
+            self._readers.append(_Reader(name, kind, reader, condition, depth))
 
     def receive(self, stopped: Callable[[], bool] = lambda: False) -> Iterator[list[Received]]:
         """Yield what arrived, at least ten times a second, if only nothing; until stopped."""
         wait = self._dds["util"].duration(seconds=_WAKE_S)
         while not stopped():
-            with self._our_errors("the network cannot be read"):
+            with self._reading, self._our_errors("the network cannot be read"):
+                if self._closed:
+                    return
                 self._waiting.wait(wait)
                 now_s, found = time.monotonic(), list[Received]()
                 for one in self._readers:
-                    taken = one.reader.take(_DEPTH, condition=one.condition)
+                    taken = one.reader.take(one.depth, condition=one.condition)
                     contents = [bytes(sample.content) for sample in taken if _is_whole(sample)]
                     found += [Received(one.topic, one.kind, each, now_s) for each in contents]
             yield found
@@ -164,16 +168,19 @@ class Network:
         """Publish a message; ``kept`` = who subscribes late gets the last one of the topic, too."""
         del time_ns  # of the header; on the wire is the time of sending
         kind, content = message[0], encode(message)
-        with self._lock, self._our_errors(f"{topic} cannot be published"):
+        with self._writing, self._our_errors(f"{topic} cannot be published"):
+            if self._closed:
+                raise SourceError("the network was left already", where=topic)
             if topic not in self._writers:
-                quality = self._quality(reliable=True, kept=kept, depth=1 if kept else _DEPTH)
+                quality = self._quality(True, kept, 1 if kept else DEPTH)
                 publish = self._dds["pub"].DataWriter
                 self._writers[topic] = publish(self._participant, self._topic(topic, kind), quality)
             self._writers[topic].write(_type_of(kind)(content))
 
     def close(self) -> None:
         """Leave the network. What is kept is gone then, as with any node of ROS 2."""
-        with self._lock:
+        self._closed = True
+        with self._reading, self._writing:
             self._waiting = self._endpoints = None
             self._readers.clear()
             self._writers.clear()
@@ -182,7 +189,7 @@ class Network:
     def _topic(self, name: str, kind: str) -> Any:
         return self._dds["topic"].Topic(self._participant, f"{_PREFIX}{name}", _type_of(kind))
 
-    def _quality(self, *, reliable: bool, kept: bool, depth: int) -> Any:
+    def _quality(self, reliable: bool, kept: bool, depth: int) -> Any:
         of, core = self._dds["core"].Policy, self._dds["core"]
         block = self._dds["util"].duration(milliseconds=100)
         return core.Qos(
@@ -208,6 +215,7 @@ class _Reader(NamedTuple):
     kind: str
     reader: Any
     condition: Any
+    depth: int
 
 
 @cache

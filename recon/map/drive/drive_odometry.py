@@ -10,9 +10,11 @@ import numpy as np
 
 from recon.core.errors import ReconError, RegistrationError
 from recon.core.geometry.se3 import make_transform
+from recon.core.progress import LOGGER
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.map.settings import DriveSettings
+from recon.odometry.arriving import ArrivingGyro, ArrivingPath
 from recon.odometry.guide import Guide
 from recon.odometry.imu import seen_runs
 from recon.odometry.imu_fit import FittedImu, fit_imu
@@ -83,6 +85,24 @@ def odometry_of(
             settings = settings.model_copy(update={"prior": axes})
         return make_odometry(settings.method, settings, prior, config.scale, guide)
     return KnownPoses(_of_frames(known_poses, source))
+
+
+def arriving_guide(
+    source: StereoSource, reconstructor: FrameReconstructor, config: DriveSettings
+) -> Guide | None:
+    """Return what else says how a live drive moves: its wheels, or else its inertial unit."""
+    if source.recent_path() is not None:
+        camera = config.odometry.prior.model_copy(update={"axes": "camera"})
+        return ArrivingPath(source.recent_path, camera)
+    record = source.read_imu() if config.odometry.imu else None
+    if record is None:
+        return None
+    if record.T_camera_imu is None:
+        LOGGER.warning("IMU not used: no static transform says how it lies to the camera")
+        return None
+    R_left = turns_of(source.calibration, config.rectification).R_left
+    R_camera_imu = R_left @ record.T_camera_imu[:3, :3]
+    return ArrivingGyro(source.read_imu, R_camera_imu, reconstructor.camera.focal_px, config.scale)
 
 
 def imu_of(

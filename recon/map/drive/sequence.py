@@ -32,7 +32,13 @@ from recon.core.work import serial_algebra
 from recon.look.tracks import LiveTracks, StereoTracks
 from recon.map.drive.drive import Drive, Workspace
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
-from recon.map.drive.drive_odometry import UsedPrior, axes_of, imu_of, odometry_of
+from recon.map.drive.drive_odometry import (
+    UsedPrior,
+    arriving_guide,
+    axes_of,
+    imu_of,
+    odometry_of,
+)
 from recon.map.drive.mapper import Mapper
 from recon.map.fusion import fusion_range_m
 from recon.map.map import Map
@@ -41,6 +47,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.map.tiles import Tiles
 from recon.odometry.checked import CheckedOdometry
+from recon.odometry.guide import Guide
 from recon.odometry.health import name_frames, segment_numbers
 from recon.odometry.imu_fit import FittedImu
 from recon.odometry.protocol import Odometry, OdometryHealth
@@ -220,7 +227,9 @@ def map_sequence(
         used = axes_of(prior, source, reconstructor, config.odometry.prior)
     elif known_poses is None and not by_sfm:
         imu = imu_of(source, reconstructor, config)
-    guide = None if imu is None else imu.guide
+    guide: Guide | None = None if imu is None else imu.guide
+    if source.live and known_poses is None and not by_sfm:
+        guide = arriving_guide(source, reconstructor, config)
     session = work.session(source, config)
     odometry: Odometry
     if by_sfm:
@@ -236,7 +245,7 @@ def map_sequence(
         search=looking,
         scale=config.scale,
     )
-    up = None if guide is None else guide.up
+    up = None if imu is None or imu.guide is None else imu.guide.up
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch, up)
     checked = odometry.odometry if isinstance(odometry, CheckedOdometry) else None
     tracks = None

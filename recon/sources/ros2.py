@@ -1,0 +1,399 @@
+"""Drives that arrive as topics of ROS 2: images and their cameras, and what else guides them."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from recon.core.errors import FormatError, ReconError, SettingsError, SourceError
+from recon.core.geometry.se3 import invert, make_transform, rotation_from_quaternion
+from recon.core.progress import LOGGER, stage
+from recon.core.text import counted
+from recon.core.values import ImuRecord, Recorded, Rig, StereoPair, Trajectory, check_size
+from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.image import join_pair
+from recon.io.cameras.ros import NS
+from recon.io.imu import imu_of
+from recon.io.ros.contents import (
+    IMU,
+    POSES,
+    TRANSFORMS,
+    BagPose,
+    camera_info_of,
+    image_of,
+    imu_row,
+    poses_of,
+    stamp_ns,
+)
+from recon.io.ros.dds import Network, NetworkTopic, Received
+from recon.sources.bag import find_mount, static_transform
+from recon.sources.calibration import read_rig
+from recon.sources.settings import SourceSettings
+from recon.sources.source import Mount, SourceFigures, StereoSource
+from recon.sources.topics import (
+    Topic,
+    choose_topics,
+    find_imu,
+    info_topic,
+    info_topics,
+    rig_of_infos,
+)
+
+ADDRESS: Final = "ros2:"
+STATIC: Final = "/tf_static"
+INITIAL_POSE: Final = "/initialpose"
+_WITH_COVARIANCE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
+_PATIENCE_S: Final = 30.0  # for a driver that starts meanwhile
+_QUIET_S: Final = 2.0  # without a pair, after which it is said
+_BELIEVED: Final = 3  # images in a row that contradict the time of one before, which is wrong then
+_WAITING: Final = 10  # images of a camera that may wait for a partner
+_KEPT: Final = 1000  # pairs of which the stamps are known to the nanosecond
+_FAST: Final = 2000  # messages of an inertial unit or of wheels that are kept: some seconds
+
+
+class _Image(NamedTuple):
+    """An image that waits for its partner; it is decoded when it has one."""
+
+    stamp_ns: int
+    message: Any
+    arrived_s: float
+
+
+class Ros2Source(StereoSource):
+    """The pairs that arrive on two topics, for as long as a network is open."""
+
+    live = True
+    name: str
+    calibration: Rig
+    description: str
+
+    def __init__(
+        self,
+        network: Network,
+        images: tuple[str, str],
+        settings: SourceSettings,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.network, self.images, self._settings = network, images, settings
+        self.name = f"{ADDRESS}{','.join(images)}"
+        self._stopped = stopped
+        self._waiting = {topic: deque[_Image](maxlen=_WAITING) for topic in images}
+        self._last_ns, self._back = dict.fromkeys(images, 0), dict.fromkeys(images, 0)
+        self._alone = self._paired_ns = 0
+        self._refused = Counter[tuple[str, str]]()
+        self._due_s: dict[int, float] = {}
+        self._stamps_ns = dict[float, int]()
+        self._frames = dict[str, str]()  # the coordinate frame that each topic names
+        self.latest = dict[str, Any]()  # the last message of each other topic
+        self._mounted = list[BagPose]()  # static transforms
+        self._rates = dict[str, deque[list[float]]]()  # ns, rates of turn, forces, of each unit
+        self._start: Float64 | None = None
+        self._wheels = deque[tuple[int, str, Float64]](maxlen=_FAST)
+
+    def __len__(self) -> int:
+        """Return the largest number of pairs; 0 = not known."""
+        return self._settings.end or 0
+
+    def frames(self, start: int = 0) -> Iterator[StereoPair]:
+        """Yield the pairs from now on, numbered from 0; the first ``start`` are left out."""
+        index = 0
+        next(self._messages(), None)  # what has waited since the network was last read is old
+        for waiting in self._waiting.values():
+            waiting.clear()
+        for left, right in self._matching():
+            if index == self._settings.end:
+                return
+            with self._refusing():
+                images = (self._decoded(0, left), self._decoded(1, right))
+                pair = join_pair(*images, left.stamp_ns * NS, index, f"pair {index}")
+                self._due_s = {index: max(left.arrived_s, right.arrived_s)}
+                self._stamps_ns[pair.timestamp_s] = left.stamp_ns
+                if len(self._stamps_ns) > _KEPT:
+                    del self._stamps_ns[next(iter(self._stamps_ns))]
+                index += 1
+                if pair.index >= start:
+                    yield pair
+
+    def due_s(self, pair: Recorded) -> float:
+        """Return when the newest pair was whole, by `time.monotonic`."""
+        return self._due_s[pair.index]
+
+    def stamp_ns(self, timestamp_s: float) -> int:
+        """Return the stamp of a pair as it was sent: seconds in 64 bits are off by up to 120 ns."""
+        return self._stamps_ns.get(timestamp_s, round(timestamp_s / NS))
+
+    def read_mount(self) -> Mount | None:
+        return find_mount(self._mounted, self._frames.get(self.images[0], ""))
+
+    def read_imu(self) -> ImuRecord | None:
+        for topic, newest in self._rates.items():
+            rows = list(newest)  # others are added meanwhile
+            names = [f"{topic}, message {n}" for n in range(len(rows))]
+            record = imu_of(np.array(rows), names, topic)
+            T_imu_camera = self._to_camera(self._frames[topic])
+            if T_imu_camera is None:
+                return record
+            return replace(record, T_camera_imu=invert(T_imu_camera))
+        return None
+
+    def recent_path(self) -> Trajectory | None:
+        poses = list(self._wheels)  # others are added meanwhile
+        T_child_camera = self._to_camera(poses[-1][1]) if poses else None
+        if T_child_camera is None:
+            return None
+        times_ns, first = np.unique([one[0] for one in poses], return_index=True)
+        T = np.stack([poses[k][2] for k in first.tolist()])
+        return Trajectory(T @ T_child_camera, times_ns * NS)
+
+    def asked_start(self) -> Float64 | None:
+        """Return ``T_map_base`` (4, 4) that was sent since the last call, as RViz does."""
+        start, self._start = self._start, None
+        return start
+
+    def _to_camera(self, frame: str) -> Float64 | None:
+        """Return the pose (4, 4) of the left camera in a frame, by the static transforms."""
+        return static_transform(self._mounted, frame, self._frames.get(self.images[0], ""))
+
+    def warnings(self) -> list[str]:
+        out = f"{counted(self._alone, 'image')} without a partner: left out"
+        refused = [
+            f"{topic}: {counted(count, 'message')} not used: {what}"
+            for (topic, what), count in self._refused.items()
+        ]
+        return [out, *refused] if self._alone else refused
+
+    def figures(self) -> SourceFigures:
+        return SourceFigures(frames_left_out=self._alone)
+
+    def wait_for(self, what: str, known: Callable[[], bool]) -> None:
+        """Take messages until something is known; `SourceError` if it takes too long."""
+        stage(f"wait for {what}")
+        end_s = time.monotonic() + _PATIENCE_S
+        for _ in self._messages():
+            if known():
+                return
+            if time.monotonic() > end_s:
+                break
+        if self._stopped():
+            raise SourceError(f"stopped while waiting for {what}", where=self.name)
+        counts = ", ".join(
+            f"{topic}: {counted(one.publishers, 'publisher')}"
+            for topic, one in sorted(self.network.topics().items())
+        )
+        raise SourceError(
+            f"no message with {what} came in {_PATIENCE_S:.0f} s",
+            where=self.name,
+            got=counts or "no topic at all",
+            hint=f"domain {self.network.domain} was listened to, on {self.network.reach}",
+        )
+
+    def first_images(self) -> tuple[UInt8, UInt8]:
+        """Return the first image of each camera, of whatever size; they may be of two moments."""
+        sides = dict[str, UInt8]()
+
+        def decoded() -> bool:
+            for topic, waiting in self._waiting.items():
+                with self._refusing():
+                    if waiting:
+                        sides[topic] = image_of(waiting.pop().message, topic)
+            return len(sides) == len(self.images)
+
+        self.wait_for("images", decoded)
+        left, right = (sides[topic] for topic in self.images)
+        return left, right
+
+    def _matching(self) -> Iterator[tuple[_Image, _Image]]:
+        """Yield images that belong together: each is the nearest of the other camera."""
+        tolerance_ns = round(self._settings.tolerance_s / NS)
+        left, right = (self._waiting[topic] for topic in self.images)
+        told_s = time.monotonic()
+        for _ in self._messages():
+            while left and right:
+                late_ns = right[0].stamp_ns - left[0].stamp_ns
+                earlier, later = (left, right) if late_ns > 0 else (right, left)
+                nearer = len(earlier) > 1 and abs(earlier[1].stamp_ns - later[0].stamp_ns) < abs(
+                    late_ns
+                )
+                if abs(late_ns) > tolerance_ns or nearer:
+                    earlier.popleft()
+                    self._alone += 1
+                    continue
+                told_s, self._paired_ns = time.monotonic(), left[0].stamp_ns
+                yield left.popleft(), right.popleft()
+            if time.monotonic() - told_s > _QUIET_S:
+                told_s = float("inf")
+                waiting = ", ".join(f"{len(self._waiting[one])} of {one}" for one in self.images)
+                LOGGER.warning("no pair for %.0f s; images that wait: %s", _QUIET_S, waiting)
+
+    def _messages(self) -> Iterator[None]:
+        """Take what arrives, until the drive is stopped."""
+        for messages in self.network.receive(self._stopped):
+            for one in messages:
+                with self._refusing():
+                    self._take(one)
+            yield
+
+    def _take(self, one: Received) -> None:
+        message = one.parse()
+        if one.topic in self._waiting:
+            self._check_time(one.topic, stamp_ns(message))
+            self._alone += len(self._waiting[one.topic]) == _WAITING
+            self._waiting[one.topic].append(_Image(stamp_ns(message), message, one.arrived_s))
+        elif one.topic == STATIC:
+            self._mounted += poses_of(message, 0)
+        elif one.kind == IMU:
+            rows = self._rates.setdefault(one.topic, deque(maxlen=_FAST))
+            rows.append([stamp_ns(message), *imu_row(message)])
+        elif one.kind in POSES and one.topic != INITIAL_POSE:
+            self._wheels += [
+                (pose.stamp_ns, pose.child, _matrix(pose, one.topic))
+                for pose in poses_of(message, 0)
+            ]
+        else:
+            self.latest[one.topic] = message
+        if hasattr(message, "header"):
+            self._frames[one.topic] = str(message.header.frame_id).lstrip("/")
+
+    def _check_time(self, topic: str, at_ns: int) -> None:
+        """Refuse an image whose time is not after those before; or those, if several say so."""
+        if at_ns <= 0:
+            raise FormatError("image has no time in its header", where=topic)
+        before_ns = self._last_ns[topic]
+        self._back[topic] = self._back[topic] + 1 if at_ns <= before_ns else 0
+        if self._back[topic] in range(1, _BELIEVED) or at_ns <= self._paired_ns:
+            what, got = (
+                "image is not later than the one before",
+                f"{(at_ns - before_ns) * NS:.3f} s",
+            )
+            raise FormatError(what, where=topic, got=got)
+        if self._back[topic]:
+            self._waiting[topic].clear()
+        self._last_ns[topic] = at_ns
+
+    def _decoded(self, side: int, one: _Image) -> UInt8:
+        image = image_of(one.message, self.images[side])
+        check_size(self.calibration, image.shape[1], image.shape[0], self.images[side])
+        return image
+
+    @contextmanager
+    def _refusing(self) -> Iterator[None]:
+        """Say once of each fault of a topic that its messages are not used, and count them."""
+        try:
+            yield
+        except ReconError as error:
+            fault = str(error.where), error.what
+            if fault not in self._refused:
+                LOGGER.warning("%s; not used", error)
+            self._refused[fault] += 1
+
+
+def _matrix(pose: BagPose, where: str) -> Float64:
+    norm = float(np.linalg.norm(pose.xyzw))
+    if not (np.isfinite(pose.xyz_m).all() and np.isfinite(norm) and norm > 0):
+        raise FormatError("pose is not finite, or has no rotation", where=where)
+    return make_transform(rotation_from_quaternion(pose.xyzw), pose.xyz_m)
+
+
+@contextmanager
+def open_ros2(
+    address: str,
+    settings: SourceSettings,
+    prior: str | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[Ros2Source]:
+    """Join a network of ROS 2, for the body of a ``with`` statement, and find the cameras in it.
+
+    Args:
+        address: ``ros2:``, alone or with the topics of the left, or left and right images.
+        settings: How pairs are found; ``end`` is the number of pairs.
+        prior: Topic of the odometry of the wheels; None = none.
+        stopped: Asked now and then; True ends the drive.
+
+    Raises:
+        SourceError: Nobody publishes the images, or what calibrates them, within 30 seconds.
+        CalibrationError: The calibration cannot give depth.
+        SettingsError: The environment names no possible domain.
+        MissingDependencyError: The extra ``ros2`` is not installed.
+    """
+    names = [name for name in address.removeprefix(ADDRESS).split(",") if name]
+    if len(names) > 2 or not all(name.startswith("/") for name in names):
+        what, expected = "not topics of two cameras", f"such as {ADDRESS}/left/image_raw"
+        raise SettingsError(what, where=address, expected=expected)
+    if settings.shift_frames:
+        what = "images on a network are paired by their stamps"
+        raise SettingsError(
+            what, where="source.shift_frames", got=settings.shift_frames, expected=0
+        )
+    named = dict(zip(("left", "right"), names, strict=False))
+    settings = settings.model_copy(update=named)
+    with closing(Network()) as network:
+        images, also, topics = _find_cameras(network, settings, address, stopped)
+        source = Ros2Source(network, images, settings, stopped)
+        _listen(source, network, topics, prior)
+        sizes = [image.shape[:2] for image in source.first_images()]
+        size, note = (sizes[0][1], sizes[0][0]), ""
+        if settings.has_camera:
+            rig, source.files = read_rig(settings, Path(), size)
+            known = f"calibration {settings.calibration or 'in numbers'}"
+        else:
+            infos = info_topics(topics, images, source.name)
+            source.wait_for("CameraInfo", lambda: all(one in source.latest for one in infos))
+            left, right = (camera_info_of(source.latest[one]) for one in infos)
+            rig, note = rig_of_infos(left, right, images, source.name, size)
+            known = "their CameraInfo" + (f" ({note})" if note else "")
+        source.calibration = rig
+        source.description = (
+            f"topics of ROS 2, domain {network.domain}, {network.reach}; paired by stamps, "
+            f"{known}{also}"
+        )
+        yield source
+
+
+def _find_cameras(
+    network: Network, settings: SourceSettings, where: str, stopped: Callable[[], bool]
+) -> tuple[tuple[str, str], str, dict[str, Topic]]:
+    """Wait until somebody publishes two image topics; return them, a note, and all topics."""
+    stage(f"look for cameras in domain {network.domain}, on {network.reach}")
+    end_s, before = time.monotonic() + _PATIENCE_S, -1
+    while True:
+        topics = {one.name: Topic(one.name, one.kind) for one in network.topics().values()}
+        settled, before = len(topics) == before, len(topics)
+        try:
+            images, also = choose_topics(topics, settings, where)
+            if settled:  # else the calibration, or a better pair, may be about to be found
+                return images, also, topics
+        except SourceError as error:
+            if time.monotonic() > end_s or stopped():
+                listened = f"domain {network.domain} was listened to, on {network.reach}"
+                got = error.got if topics else "no topic at all"
+                raise SourceError(error.what, where=where, got=got, expected=error.expected,
+                                  hint=listened) from error  # fmt: skip
+        time.sleep(0.5)
+
+
+def _listen(
+    source: Ros2Source, network: Network, topics: dict[str, Topic], prior: str | None
+) -> None:
+    """Subscribe to the images of a source, and to what is beside them."""
+    offered = network.topics()
+    infos = (info_topic(topics, image) for image in source.images)
+    imu = find_imu(topics)
+    wanted = [*source.images, *(one for one in (*infos, imu) if one is not None)]
+    if prior is not None:
+        if prior not in topics or topics[prior].kind not in POSES:
+            got = ", ".join(name for name, one in topics.items() if one.kind in POSES)
+            what = "nobody publishes poses on this topic"
+            raise SourceError(what, where=prior, got=f"poses on {got}" if got else "no poses")
+        wanted.append(prior)
+    for name in dict.fromkeys(wanted):
+        network.subscribe(offered[name], _FAST if name in (imu, prior) else _WAITING)
+    # Of others that may come later: of RViz, and of the description of the robot.
+    network.subscribe(NetworkTopic(INITIAL_POSE, _WITH_COVARIANCE))
+    network.subscribe(offered.get(STATIC, NetworkTopic(STATIC, TRANSFORMS[0], True, True)))
