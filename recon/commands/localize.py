@@ -71,7 +71,8 @@ def run_localize(
         run.check_targets(inputs)
         before = look_first(source, config, options, run, map_.known_rig(source.calibration))
         rig, source = before.rig, before.drive
-        workspace = Workspace(map_, run.watch, run.threads)
+        height_m = None if folder is None else figure_of(folder, "camera_height_m")
+        workspace = Workspace(map_, run.watch, run.threads, options.listener, height_m)
         where = {"map_run": str(map_path), "T_map_world": map_.first.T_map_world.tolist()}
         write_json(run.state(SUMMARY), where)
         note = begin_states(run.state(STATES))
@@ -84,6 +85,7 @@ def run_localize(
             *rig.warnings(before.findings),
             *drive.warnings(),
             *source.warnings(),
+            *options.listener.warnings(),
         ]
         summary = LocalizeSummary(
             source=source.name,
@@ -96,7 +98,6 @@ def run_localize(
         )
         made = LocalizeResult(source.name, str(map_path), drive, grid, summary)
         with run.stage("write"):
-            height_m = None if folder is None else figure_of(folder, "camera_height_m")
             export_localized(drive, height_m, run.content)
             write_states(run.path(STATES), drive.frames)
         with run.report(summary) as summary:

@@ -140,7 +140,7 @@ def run_map(
             errors = compare_with_truth(source, mapped, made.grid, true, poses_given=given)
         drift = expected_drift(mapped.trajectory, mapped.health, mapped.camera, rig.length_ratio)
         said = [*rig.warnings(findings), *_next_drive(source, config, rig)]
-        doubts = [*said, *_warnings(source, mapped, drift)]
+        doubts = [*said, *_warnings(source, mapped, drift), *options.listener.warnings()]
         breaks = break_warnings(mapped)
         first = [] if mapped.sfm is None else mapped.sfm.warnings()
         known = [*first, *breaks, *findings]
@@ -312,7 +312,7 @@ def map_drive(
         config,
         known_poses=options.known_poses,
         prior=options.prior,
-        workspace=Workspace(map_, run.watch, run.threads),
+        workspace=Workspace(map_, run.watch, run.threads, options.listener),
     )
 
 

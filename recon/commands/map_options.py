@@ -25,6 +25,7 @@ from recon.export.make import USUAL
 from recon.io.files import StrPath, resolved
 from recon.io.trajectory import read_trajectory
 from recon.map.drive.drive import ANEW, resuming, session_info
+from recon.map.listener import NOBODY, DriveListener
 from recon.map.map import Map
 from recon.map.store.session import IMAGES
 from recon.run.batch.cluster import BatchOptions
@@ -55,6 +56,7 @@ class MapOptions:
         audit: Whether a quick audit of the recording comes first, unless the settings forbid it.
         warn: Given the findings of the audit, before the drive is mapped.
         begun: Given the folder of the run, once its map or what it has located can be read.
+        listener: Is told of the drive while it goes on.
         resume: Resume the unfinished run in ``out``.
         workers: Where pieces of the drive are mapped side by side; None = in one piece, here,
             unless a run that is resumed was begun in pieces.
@@ -73,6 +75,7 @@ class MapOptions:
     audit: bool = True
     warn: Callable[[tuple[str, ...]], None] = lambda findings: None
     begun: Callable[[Path], None] = lambda folder: None
+    listener: DriveListener = NOBODY
     resume: bool = False
     workers: BatchOptions | None = None
     source: StrPath | None = None

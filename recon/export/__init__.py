@@ -5,5 +5,6 @@
 - `cloud.py`, `occupancy.py`, `costmap.py`, `rasters.py`, `mesh/pieces.py`: products from tiles;
   `colmap.py`, `nerfstudio.py`, `mcap.py`: for other tools, with images;
 - `trajectories.py`: the paths of drives; `pair.py`: what is made of a single pair, or of a cloud;
+- `robot.py`: topics of a robot while it drives, with its map as far as it is made, `growing.py`;
 - `mesh/`: surfaces, of clouds, pairs and maps, and their textures.
 """

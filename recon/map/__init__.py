@@ -7,5 +7,6 @@
 - `tiles.py`: the map in squares, from which all products are made; `cut.py`: submaps are cut into
   them; `ground/grid.py`: the flat map;
 - `sessions/joining.py`: several drives in one map; `localize/localizer.py`: a drive found in a map;
+- `listener.py`: who is told of a drive while it goes on;
 - `map.py`: `recon.Map`, the file with all that can be done with it.
 """

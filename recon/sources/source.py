@@ -294,6 +294,9 @@ class DerivedSource(StereoSource):
         self.source, self.name, self.description = source, source.name, source.description
         self.calibration, self.files, self.stereo = source.calibration, source.files, source.stereo
 
+    def read_mount(self) -> Mount | None:
+        return self.source.read_mount()
+
 
 class SourcePart(DerivedSource):
     """Pairs ``first`` to ``last - 1`` of a source, of which ``lead`` only lead the odometry."""

@@ -14,11 +14,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from recon.core.errors import ReconError
-from recon.core.geometry.se3 import apply, invert, transform_cloud
+from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
 from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.camera import project
+from recon.export.growing import submap_cloud
 from recon.export.product import open_images
 from recon.io.files import read_text, reading
 from recon.io.models.mesh import read_mesh
@@ -139,10 +140,9 @@ def _snapshot(run: Path, path: Path, taken: list[Scene]) -> Scene:
 def _submap(map_: Map, number: int) -> Scene:
     drive, settings = map_.first, settings_of(map_.first)
     submap, T = drive.submaps[number], drive.T_map_world
-    sums = submap.fused.cloud(settings.fusion.voxel_m, settings.fusion.min_count)
-    if not len(sums) or not len(submap.occupancy):
+    cloud = submap_cloud(drive, submap)
+    if not len(cloud) or not len(submap.occupancy):
         return Scene()
-    cloud = transform_cloud(sums, T, frame="map")
     voxels = submap.occupancy.voxels(settings.occupancy.resolution_m)
     path_m = apply(T, drive.odometry.positions_m[submap.first_frame :][: submap.frames])
     ground = estimate_ground_surface(cloud, path_m, settings.ground, settings.occupancy.max_range_m)

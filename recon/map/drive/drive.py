@@ -27,6 +27,7 @@ from recon.look.tracks import LiveTracks
 from recon.map.builders import thin_rays
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.mapper import FrameResult, Mapper
+from recon.map.listener import NOBODY, DriveBegun, DriveListener, PoseTeller, mount_of
 from recon.map.map import Map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
@@ -62,6 +63,10 @@ class Drive:
         self._loops, self._map = loops, workspace.map
         self._views = NewViews(reconstructor.camera)
         self._stage = workspace.stopwatch.stage
+        self._listener, mount = workspace.listener, mount_of(source, config.rectification)
+        self._teller = PoseTeller(mount, config.scale)
+        begun = DriveBegun(source, reconstructor.camera, self._map.store.path, False, mount)
+        self._listener.on_begin(begun)
         self.sample: ReconstructedFrame | None = None
         self._saved = 0
         self._start = self._last = self._saved_s = time.perf_counter()
@@ -76,6 +81,12 @@ class Drive:
                 self._loops.restore(path.T_world_camera, segment_numbers(health))
             self._saved, self._last = len(self.mapper), time.perf_counter()
             self._start = self._last - state["seconds"]
+
+    def tell(self, frame: FrameResult) -> None:
+        """Tell the listener where a frame is, once the map has axes."""
+        if self.mapper.axes is not None:
+            at = (frame.time_s, frame.T_world_camera, frame.health)
+            self._listener.on_pose(self._teller.mapped(*at, *self.mapper.axes))
 
     def begin_at(self, frame: int) -> None:
         """Lay the axes of the map by the ground of a frame, and save what the odometry found."""
@@ -152,6 +163,7 @@ class Drive:
         if len(self.mapper) > self._saved:
             self._save()
         self.mapper.close()
+        self._listener.on_end()
 
     def close_loops(self, path: Trajectory) -> DriveLoops | None:
         """Return the loops of the path, which the map keeps; None = they are not looked for."""
@@ -185,6 +197,7 @@ class Drive:
                 state = {"mapper": self.mapper.state(), "seconds": seconds, "last_view": last_view}
                 self.session.set_state(state)
             self._map.commit()
+        self._listener.on_map()
         self._saved, self._saved_s = len(self.mapper), time.perf_counter()
 
 
@@ -218,7 +231,8 @@ def poses_first(
             source.note_located(index)
             valid_ratio = float(np.mean(disparity.measured))
             T = found.T_world_camera
-            yield FrameResult(index, len(source), 0.0, valid_ratio, 0, T, found.health)
+            about = (index, len(source), 0.0, valid_ratio, 0, T, found.health)
+            yield FrameResult(*about, time_s=rectified.timestamp_s)
             behind.add((rectified, found))
             if tracks is not None:
                 tracks.add(index, frame, found)
@@ -315,6 +329,9 @@ class Workspace:
     map: Map = field(default_factory=Map.temporary)
     stopwatch: Stopwatch = field(default_factory=Stopwatch)  # times each stage
     threads: int | None = None  # threads of the matcher; None = all cores
+    listener: DriveListener = NOBODY  # is told of the drive while it goes on
+    # Of the left camera above the ground, where the map that is searched knows it
+    camera_height_m: float | None = None
 
     def session(self, source: StereoSource, config: DriveSettings) -> Session:
         """Return the session of a drive: the last one of the map, or a new one."""

@@ -58,6 +58,8 @@ class Mapper:
         self._segments = SegmentCounter()
         self._builder: SubmapBuilder | None = None
         self._grain = ray_grain(config.occupancy) if config.occupancy.keep_rays else None
+        # From world to map axes, and the height of the camera above the ground, if it was seen.
+        self.axes: tuple[Float64, float | None] | None = None
 
     def __len__(self) -> int:
         return len(self.session)
@@ -92,7 +94,7 @@ class Mapper:
         self._behind.begin(partial(self._integrate, *work))
         self.session.add_frame(T_world_camera, frame.pair.timestamp_s, health)
         valid_ratio = float(np.mean(frame.disparity.measured))
-        found = (len(frame.cloud), T_world_camera, health, segment)
+        found = (len(frame.cloud), T_world_camera, health, segment, frame.pair.timestamp_s)
         return FrameResult(len(self) - 1, total, 0.0, valid_ratio, *found)
 
     def _integrate(
@@ -152,6 +154,8 @@ class Mapper:
         ground = estimate_ground(cloud, config.scale, self._up)
         T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m, self._up)
         self.session.set_axes(T_map_world, self._camera)
+        seen_m = None if ground is None else ground.height_m
+        self.axes = T_map_world, config.ground.camera_height_m or seen_m
         self._behind.wait()
         before, builder = self._builder, self._new_builder()
         if before is not None:
@@ -261,6 +265,7 @@ class FrameResult:
     T_world_camera: Float64  # (4, 4)
     health: OdometryHealth
     segment: int = 0  # of the drive, see `SegmentCounter`; -1 = the pose is not trusted
+    time_s: float = math.nan
 
     def __post_init__(self) -> None:
         freeze(self, "T_world_camera", np.float64, (4, 4))

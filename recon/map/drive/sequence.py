@@ -259,6 +259,7 @@ def map_sequence(
     try:
         with serial_algebra(), series(source.name, len(source)) as shown, closing(steps):
             for step in steps:
+                drive.tell(step)
                 shown.on_step(step)
             drive.wait()
     finally:

@@ -19,7 +19,7 @@ from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.map.localize.belief import MAX_SIGMA_M, Belief
 from recon.map.localize.surroundings import Surroundings
-from recon.odometry.protocol import OdometryFrame
+from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.odometry.visual import VisualEstimate, VisualOdometry
 from recon.places.closure import loop_bias
 from recon.places.detector import KnownPlaces
@@ -114,6 +114,7 @@ class Localizer:
         self._visual = VisualOdometry()
         self._belief: Belief | None = None
         self._T_odometry = np.eye(4)
+        self.odometry = OdometryResult(np.eye(4))  # of the last frame, which no map corrects
         self._path_m = 0.0
         self._frames = self._breaks = 0
 
@@ -165,6 +166,9 @@ class Localizer:
                 covariance = covariance_of(visual.information)
             T_before_now = invert(self._T_odometry) @ T_now
             self._belief = self._belief.moved(T_before_now, covariance, step_m)
+        health = visual.result.health
+        health = replace(health, ok=health.ok and (seen or not self._frames))
+        self.odometry = replace(visual.result, health=health)
         self._T_odometry, self._path_m = T_now, self._path_m + step_m
 
     def _measured(self, loop: Loop) -> tuple[Float64, Float64]:

@@ -20,6 +20,7 @@ from recon.core.values.arrays import Bool, Float64
 from recon.core.work import look_ahead, serial_algebra
 from recon.look.rig import RigFigures
 from recon.map.drive.drive import Workspace
+from recon.map.listener import DriveBegun, PoseTeller, mount_of
 from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
@@ -221,6 +222,10 @@ def localize_sequence(
         return OdometryFrame(*reconstructor.match(pair))
 
     frames: list[LocalizedFrame] = []
+    mount, listener = mount_of(source, config.rectification), workspace.listener
+    teller, T_map_world = PoseTeller(mount, config.scale), map_.first.T_map_world
+    listener.on_begin(DriveBegun(source, reconstructor.camera, map_.store.path, True, mount))
+    base = T_map_world, workspace.camera_height_m or config.ground.camera_height_m
     begun = time.perf_counter()
     stage("localize")
     with serial_algebra(), series(source.name, len(source)) as shown:
@@ -235,11 +240,12 @@ def localize_sequence(
             frames.append(LocalizedFrame(index, frame.pair.timestamp_s, seconds, located))
             note(frames[-1])
             source.note_located(index)
+            listener.on_pose(teller.found(frames[-1].time_s, localizer.odometry, located, *base))
             shown.on_step(frames[-1])
             config.memory.check(f"frame {index}")
     if not frames:
         raise RegistrationError("the source has no frame", where=source.name)
-    T_map_world = map_.first.T_map_world
+    listener.on_end()
     return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
 
 

@@ -25,7 +25,9 @@ from recon.core.work import side_by_side
 from recon.io.files import resolved
 from recon.map.builders import OccupancyBuilder, Submap
 from recon.map.cut import Cutter, TileKey, TileParts
+from recon.map.fusion import join_fused
 from recon.map.occupancy.bodies import FrameObservations
+from recon.map.occupancy.part import join_occupancy
 from recon.map.sessions.joining import seen_before
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
@@ -55,15 +57,24 @@ def settings_of(session: Session) -> DriveSettings:
     return DriveSettings.parse(config, where=session.where)
 
 
-def place_map(map_: MapFile, settings: DriveSettings, threads: int = 1) -> PlacedMap:
+def place_map(
+    map_: MapFile,
+    settings: DriveSettings,
+    threads: int = 1,
+    *,
+    only: Collection[int] | None = None,
+) -> PlacedMap:
     """Cut the linked drives of a map into tiles, with the settings of its products.
+
+    ``only`` are numbers of submaps, of a map that is being made: the others are left out, and the
+    path of their frames is NaN.
 
     Occupancy that the drive kept is taken where it was made with these settings; else it is made
     from its rays, of so many submaps at a time. A map without rays has a cloud, and no occupancy.
     """
     placed = PlacedSubmaps(map_, settings)
-    submaps: Iterable[Submap] = placed
-    if not placed.ready:
+    submaps: Iterable[Submap] = placed if only is None else placed.only(only)
+    if not placed.ready and only is None:
         # They may be cut several times, and are slow to make: once, into a temporary store.
         submaps = made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
         for submap in side_by_side(placed.__getitem__, range(len(placed)), threads=threads):
@@ -75,7 +86,12 @@ def place_map(map_: MapFile, settings: DriveSettings, threads: int = 1) -> Place
         placed.corrections,
         drives=placed.drives,
     )
-    return _with_path(map_, settings, tiles)
+    whole = _with_path(map_, settings, tiles)
+    if only is None:
+        return whole
+    used = np.isin(tiles.submap_of_frame, [*only])
+    path_m = np.where(used[:, None], whole.path_m[: len(used)], np.nan)
+    return PlacedMap(tiles, path_m, whole.trusted[: len(used)] & used)
 
 
 def place_map_on(
@@ -124,6 +140,7 @@ class PlacedSubmaps:
         for session in [] if self.ready else sessions:
             check_rays(session, settings)
         self._settings = settings
+        self._entries = sessions[0].submaps.entries
         self._apart = [_without_place(map_, session) for session in sessions]
         self.drives = [len(session.submaps) for session in sessions]
         self.corrections = sessions[0].corrections() if alone else None
@@ -138,6 +155,13 @@ class PlacedSubmaps:
 
     def __iter__(self) -> Iterator[Submap]:
         return map(self.__getitem__, range(len(self)))
+
+    def only(self, numbers: Collection[int]) -> Iterator[Submap]:
+        """Yield all submaps of an only drive, but those of other numbers empty, and not read."""
+        nothing = join_fused(()), join_occupancy(())
+        for n, entry in enumerate(self._entries):
+            frames = entry.first_frame, entry.frames
+            yield self[n] if n in numbers else Submap(n, *frames, *nothing)
 
     def __getitem__(self, number: int) -> Submap:
         """Return a submap by its number among those of all drives."""
