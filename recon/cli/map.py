@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -280,6 +281,7 @@ def live(
     with shared.one_line_errors(), ExitStack() as stack:
         from recon.cli.progress import announce
         from recon.commands.localize import run_live
+        from recon.export.robot import RobotTopics
         from recon.rig.capture import is_camera, open_camera_source
         from recon.sources.ros2 import ADDRESS, open_ros2
 
@@ -294,7 +296,9 @@ def live(
             if right_camera is not None:
                 raise typer.BadParameter(f"both topics are one argument: {ADDRESS}/left,/right")
             network = open_ros2(source, settings.source, stopped=stopped)
-            drive = stack.enter_context(network)
+            drive = over_network = stack.enter_context(network)
+            topics = RobotTopics(over_network.network, stamp_ns=over_network.stamp_ns)
+            options = replace(options, listener=topics)
             announce(drive, quiet=shared.quiet, verbose=shared.verbose)
         elif right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]

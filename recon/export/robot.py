@@ -134,7 +134,8 @@ class RobotTopics(DriveListener):
 
     def _mounted(self, T_base_camera: Float64) -> list[tuple[str, str, Float64]]:
         beside = make_transform(np.eye(3), np.array([self._begun.camera.baseline_m, 0.0, 0.0]))
-        right = f"{self._frame}right"
+        # Beside a camera of the robot's own, whose right one has a name, too.
+        right = f"{self._frame}right" + ("" if self._begun.mount is None else "_rectified")
         return [(self._base, self._camera, T_base_camera), (self._camera, right, beside)]
 
     def _odometry(self, time_ns: int, found: DrivePose, T_odom_base: Float64) -> Message:

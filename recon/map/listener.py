@@ -111,7 +111,7 @@ class PoseTeller:
         camera_height_m: float | None,
     ) -> DrivePose:
         """Return a pose of a drive that makes a map. Behind a break it has no place there."""
-        T_base_camera = self._base(T_map_world, camera_height_m)
+        T_base_camera = self.base(T_map_world, camera_height_m)
         self._segments.add(health)
         drift = self._drifted(T_world_camera, health)
         what = (time_s, T_world_camera, T_base_camera, drift, health)
@@ -132,7 +132,7 @@ class PoseTeller:
         camera_height_m: float | None,
     ) -> DrivePose:
         """Return a pose of a drive that is found in a map."""
-        T_base_camera, T = self._base(T_map_world, camera_height_m), located.T_world_camera
+        T_base_camera, T = self.base(T_map_world, camera_height_m), located.T_world_camera
         drift = self._drifted(odometry.T_world_camera, odometry.health)
         return DrivePose(
             time_s,
@@ -146,7 +146,8 @@ class PoseTeller:
             located.note,
         )
 
-    def _base(self, T_map_world: Float64, camera_height_m: float | None) -> Float64:
+    def base(self, T_map_world: Float64, camera_height_m: float | None) -> Float64:
+        """Return ``T_base_camera`` (4, 4): as mounted, else by the height above the ground."""
         if self.mount is not None:
             return self.mount.T_base_camera
         return base_axes(T_map_world, camera_height_m)

@@ -15,13 +15,12 @@ import numpy as np
 from recon.core.errors import SourceError
 from recon.core.text import counted, is_count
 from recon.core.values import ImuRecord, Recorded, Trajectory
-from recon.core.values.arrays import UInt8
+from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import silent_opencv
 from recon.sources.source import (
     DerivedSource,
     Latency,
     LiveFigures,
-    Mount,
     SourceFigures,
     StereoSource,
 )
@@ -72,11 +71,11 @@ class LiveSource(DerivedSource):
         finally:
             self._ended = True
 
-    def read_mount(self) -> Mount | None:
-        return self.source.read_mount()
-
     def read_imu(self) -> ImuRecord | None:
         return self.source.read_imu() if self.source.live else None
+
+    def asked_start(self) -> Float64 | None:
+        return self.source.asked_start()
 
     def recent_path(self) -> Trajectory | None:
         return self.source.recent_path()

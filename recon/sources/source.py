@@ -184,6 +184,13 @@ class StereoSource(ABC):
         """Read where the camera is on the robot; None = nothing says so."""
         return None
 
+    def asked_start(self) -> Float64 | None:
+        """Return ``T_map_base`` (4, 4) where a user says that a live drive is; None = nothing new.
+
+        Roughly, and for a drive that is looked for in a map.
+        """
+        return None
+
     def occupancy_truth(
         self,
         *,

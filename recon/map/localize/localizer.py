@@ -110,6 +110,7 @@ class Localizer:
     ) -> None:
         self._known = known
         self._surroundings = surroundings
+        self._needed = frames
         self._first_fix = FirstFix(known, frames, among)
         self._visual = VisualOdometry()
         self._belief: Belief | None = None
@@ -117,6 +118,15 @@ class Localizer:
         self.odometry = OdometryResult(np.eye(4))  # of the last frame, which no map corrects
         self._path_m = 0.0
         self._frames = self._breaks = 0
+
+    @property
+    def views(self) -> Float64:
+        """float64 (N, 4, 4), ``T_world_camera`` of the views of the map."""
+        return self._known.T_world_camera
+
+    def restart(self, among: Bool) -> None:
+        """Forget where the drive is: it is looked for among some of the `views`, bool (N,)."""
+        self._belief, self._first_fix = None, FirstFix(self._known, self._needed, among)
 
     def add(self, frame: OdometryFrame, *, hurried: Callable[[], bool] = lambda: False) -> Located:
         """Locate the next frame.

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import MappingError, RegistrationError
-from recon.core.progress import series, stage
+from recon.core.progress import LOGGER, series, stage
 from recon.core.settings import scaled
 from recon.core.summary import Figures, Rows, RunSummary, inline
 from recon.core.text import counted, metres
@@ -41,6 +41,25 @@ class StartPose:
     x_m: float
     y_m: float
     yaw_deg: float
+
+    @classmethod
+    def of(cls, T_map_camera: Float64) -> StartPose:
+        """Return where a camera is that looks along its z axis; (4, 4)."""
+        ahead_x, ahead_y = T_map_camera[:2, 2].tolist()
+        x_m, y_m = T_map_camera[:2, 3].tolist()
+        return cls(x_m, y_m, math.degrees(math.atan2(ahead_y, ahead_x)))
+
+    def among(self, T_map_camera: Float64) -> Bool:
+        """Return which views (N, 4, 4) are near; `MappingError` if none is."""
+        near = self.near(T_map_camera)
+        if not near.any():
+            raise MappingError(
+                "no keyframe of the map is near the start pose",
+                got=f"{self.x_m:g},{self.y_m:g},{self.yaw_deg:g}",
+                expected=f"one within {START_WITHIN_M:g} m and {START_WITHIN_DEG:g}°",
+                hint="x and y in metres and the heading in degrees, in map axes",
+            )
+        return near
 
     def near(self, T_map_camera: Float64) -> Bool:
         off = T_map_camera[:, :2, 3] - (self.x_m, self.y_m)
@@ -181,17 +200,9 @@ def open_localizer(
     map_: MapFile, config: DriveSettings, *, start: StartPose | None = None
 ) -> Localizer:
     """Make ready to find a drive in a map, which begins roughly at ``start``; None = anywhere."""
-    known = known_places(map_)
-    among = None
+    known, among = known_places(map_), None
     if start is not None:
-        among = start.near(map_.first.T_map_world @ known.T_world_camera)
-        if not among.any():
-            raise MappingError(
-                "no keyframe of the map is near the start pose",
-                got=f"{start.x_m:g},{start.y_m:g},{start.yaw_deg:g}",
-                expected=f"one within {START_WITHIN_M:g} m and {START_WITHIN_DEG:g}°",
-                hint="x and y in metres and the heading in degrees, in map axes",
-            )
+        among = start.among(map_.first.T_map_world @ known.T_world_camera)
     return Localizer(known, Surroundings(map_, scaled(RANGE_M, config.scale)), among=among)
 
 
@@ -233,6 +244,8 @@ def localize_sequence(
         pairs = source.frames()
         matched = map(match, pairs) if source.live else look_ahead(match, pairs)
         for index, frame in enumerate(matched):
+            if (T_map_base := source.asked_start()) is not None:
+                _restart(localizer, T_map_world, T_map_base @ teller.base(*base))
             with watch.stage("localize"):
                 start_s = time.perf_counter()
                 located = localizer.add(frame, hurried=source.hurried)
@@ -247,6 +260,14 @@ def localize_sequence(
         raise RegistrationError("the source has no frame", where=source.name)
     listener.on_end()
     return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
+
+
+def _restart(localizer: Localizer, T_map_world: Float64, T_map_camera: Float64) -> None:
+    """Look for the drive where somebody says that it is, if the map has views there."""
+    try:
+        localizer.restart(StartPose.of(T_map_camera).among(T_map_world @ localizer.views))
+    except MappingError as error:
+        LOGGER.warning("%s; not used", error)
 
 
 @dataclass(frozen=True, kw_only=True)
