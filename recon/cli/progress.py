@@ -57,7 +57,7 @@ def choose_viewer(
 def watched(*, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
     """Show what a command does until the body ends, from its first moment on."""
     viewer = choose_viewer(quiet=quiet, verbose=verbose)
-    notes = _Notes() if isinstance(viewer, ProgressBar) else logging.NullHandler()
+    notes = logging.NullHandler() if quiet else _Notes(viewer)
     LOGGER.addHandler(notes)
     try:
         with showing(viewer):
@@ -71,10 +71,16 @@ def watched(*, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
 
 
 class _Notes(logging.Handler):
-    """Writes what the library logs as a warning above the bar."""
+    """Writes what the library logs as a warning: above the bar, as an event, or a line."""
+
+    def __init__(self, viewer: Shown) -> None:
+        super().__init__(logging.WARNING)
+        self._viewer = viewer
 
     def emit(self, record: logging.LogRecord) -> None:
-        if record.levelno >= logging.WARNING:
+        if isinstance(self._viewer, JsonLines):
+            self._viewer.on_note(record.getMessage())
+        else:
             sys.stderr.write(f"{record.getMessage()}\n")
 
 
@@ -92,6 +98,9 @@ class JsonLines:
 
     def on_stage(self, name: str) -> None:
         self._write({"event": "stage", "name": name})
+
+    def on_note(self, text: str) -> None:
+        self._write({"event": "note", "text": text})
 
     def on_finish(self) -> None:
         self._write({"event": "finish"})
