@@ -54,7 +54,7 @@ _PATIENCE_S: Final = 30.0  # for a driver that starts meanwhile
 _QUIET_S: Final = 2.0  # without a pair, after which it is said
 _BELIEVED: Final = 3  # images in a row that contradict the time of one before, which is wrong then
 _WAITING: Final = 10  # images of a camera that may wait for a partner
-_KEPT: Final = 1000  # pairs of which the stamps are known to the nanosecond
+_KEPT: Final = 1000  # pairs of which the stamp is known to the nanosecond
 _FAST: Final = 2000  # messages of an inertial unit or of wheels that are kept: some seconds
 
 
@@ -87,12 +87,12 @@ class Ros2Source(StereoSource):
         self._waiting = {topic: deque[_Image](maxlen=_WAITING) for topic in images}
         self._last_ns, self._back = dict.fromkeys(images, 0), dict.fromkeys(images, 0)
         self._alone = self._paired_ns = 0
+        self._counting = False  # images without a partner: not where a drive begins
         self._refused = Counter[tuple[str, str]]()
-        self._due_s: dict[int, float] = {}
-        self._stamps_ns = dict[float, int]()
+        self._sent = dict[float, tuple[int, float]]()  # stamp and arrival of the last pairs
         self._frames = dict[str, str]()  # the coordinate frame that each topic names
         self.latest = dict[str, Any]()  # the last message of each other topic
-        self._mounted = list[BagPose]()  # static transforms
+        self._mounted = dict[tuple[str, str], BagPose]()  # the last of each static transform
         self._rates = dict[str, deque[list[float]]]()  # ns, rates of turn, forces, of each unit
         self._start: Float64 | None = None
         self._wheels = deque[tuple[int, str, Float64]](maxlen=_FAST)
@@ -107,30 +107,32 @@ class Ros2Source(StereoSource):
         next(self._messages(), None)  # what has waited since the network was last read is old
         for waiting in self._waiting.values():
             waiting.clear()
+        self._counting = False
         for left, right in self._matching():
             if index == self._settings.end:
                 return
             with self._refusing():
                 images = (self._decoded(0, left), self._decoded(1, right))
                 pair = join_pair(*images, left.stamp_ns * NS, index, f"pair {index}")
-                self._due_s = {index: max(left.arrived_s, right.arrived_s)}
-                self._stamps_ns[pair.timestamp_s] = left.stamp_ns
-                if len(self._stamps_ns) > _KEPT:
-                    del self._stamps_ns[next(iter(self._stamps_ns))]
+                arrived_s = max(left.arrived_s, right.arrived_s)
+                self._sent[pair.timestamp_s] = left.stamp_ns, arrived_s
+                if len(self._sent) > _KEPT:
+                    del self._sent[next(iter(self._sent))]
                 index += 1
                 if pair.index >= start:
                     yield pair
 
     def due_s(self, pair: Recorded) -> float:
-        """Return when the newest pair was whole, by `time.monotonic`."""
-        return self._due_s[pair.index]
+        """Return when a pair was whole, by `time.monotonic`."""
+        return self._sent[pair.timestamp_s][1]
 
     def stamp_ns(self, timestamp_s: float) -> int:
         """Return the stamp of a pair as it was sent: seconds in 64 bits are off by up to 120 ns."""
-        return self._stamps_ns.get(timestamp_s, round(timestamp_s / NS))
+        known = self._sent.get(timestamp_s)
+        return round(timestamp_s / NS) if known is None else known[0]
 
     def read_mount(self) -> Mount | None:
-        return find_mount(self._mounted, self._frames.get(self.images[0], ""))
+        return find_mount([*self._mounted.values()], self._frames.get(self.images[0], ""))
 
     def read_imu(self) -> ImuRecord | None:
         for topic, newest in self._rates.items():
@@ -159,7 +161,9 @@ class Ros2Source(StereoSource):
 
     def _to_camera(self, frame: str) -> Float64 | None:
         """Return the pose (4, 4) of the left camera in a frame, by the static transforms."""
-        return static_transform(self._mounted, frame, self._frames.get(self.images[0], ""))
+        return static_transform(
+            [*self._mounted.values()], frame, self._frames.get(self.images[0], "")
+        )
 
     def warnings(self) -> list[str]:
         out = f"{counted(self._alone, 'image')} without a partner: left out"
@@ -223,8 +227,9 @@ class Ros2Source(StereoSource):
                 )
                 if abs(late_ns) > tolerance_ns or nearer:
                     earlier.popleft()
-                    self._alone += 1
+                    self._alone += self._counting
                     continue
+                self._counting = True
                 told_s, self._paired_ns = time.monotonic(), left[0].stamp_ns
                 yield left.popleft(), right.popleft()
             if time.monotonic() - told_s > _QUIET_S:
@@ -244,18 +249,19 @@ class Ros2Source(StereoSource):
         message = one.parse()
         if one.topic in self._waiting:
             self._check_time(one.topic, stamp_ns(message))
-            self._alone += len(self._waiting[one.topic]) == _WAITING
+            self._alone += self._counting and len(self._waiting[one.topic]) == _WAITING
             self._waiting[one.topic].append(_Image(stamp_ns(message), message, one.arrived_s))
         elif one.topic == STATIC:
-            self._mounted += poses_of(message, 0)
+            self._mounted |= {(edge.parent, edge.child): edge for edge in poses_of(message, 0)}
         elif one.kind == IMU:
             rows = self._rates.setdefault(one.topic, deque(maxlen=_FAST))
             rows.append([stamp_ns(message), *imu_row(message)])
-        elif one.kind in POSES and one.topic != INITIAL_POSE:
-            self._wheels += [
-                (pose.stamp_ns, pose.child, _matrix(pose, one.topic))
-                for pose in poses_of(message, 0)
-            ]
+        elif one.kind in POSES:
+            poses = [(p.stamp_ns, p.child, _matrix(p, one.topic)) for p in poses_of(message, 0)]
+            if one.topic == INITIAL_POSE:
+                self._start = poses[0][-1]
+            else:
+                self._wheels += poses
         else:
             self.latest[one.topic] = message
         if hasattr(message, "header"):
@@ -268,11 +274,8 @@ class Ros2Source(StereoSource):
         before_ns = self._last_ns[topic]
         self._back[topic] = self._back[topic] + 1 if at_ns <= before_ns else 0
         if self._back[topic] in range(1, _BELIEVED) or at_ns <= self._paired_ns:
-            what, got = (
-                "image is not later than the one before",
-                f"{(at_ns - before_ns) * NS:.3f} s",
-            )
-            raise FormatError(what, where=topic, got=got)
+            what, got = "image is not later than the one before", (at_ns - before_ns) * NS
+            raise FormatError(what, where=topic, got=f"{got:.3f} s")
         if self._back[topic]:
             self._waiting[topic].clear()
         self._last_ns[topic] = at_ns

@@ -7,13 +7,16 @@ what is sent and received against these types; their bytes are made and read by 
 from __future__ import annotations
 
 import os
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any, Final, NamedTuple
+from xml.etree import ElementTree
 
 from recon.core.errors import FormatError, SettingsError, SourceError, require
 from recon.core.text import counted
@@ -87,6 +90,7 @@ def configuration_of(environment: Mapping[str, str] = os.environ) -> tuple[str |
     configuration of Cyclone.
     """
     if environment.get(_CYCLONE):
+        _check_configuration(environment[_CYCLONE])
         return None, f"as {_CYCLONE} says"
     asked = environment.get(_RANGE, "").strip().upper() or "LOCALHOST"
     if asked == "SUBNET":
@@ -97,6 +101,18 @@ def configuration_of(environment: Mapping[str, str] = os.environ) -> tuple[str |
     return _LOOPBACK, f"this machine alone ({_RANGE}=SUBNET for the local network)"
 
 
+def _check_configuration(text: str) -> None:
+    """Refuse what Cyclone would pass over, to talk to the whole network then."""
+    parts = [text] if text.lstrip().startswith("<") else text.split(",")
+    try:
+        for part in (one.strip().removeprefix("file://") for one in parts):
+            # Of the user's own environment, which can do worse than long entities.
+            ElementTree.fromstring(part if part.startswith("<") else Path(part).read_bytes())  # noqa: S314
+    except (OSError, ElementTree.ParseError) as error:
+        what, expected = "not a configuration", "XML, or file:// and the path of some"
+        raise SettingsError(what, where=_CYCLONE, got=error, expected=expected) from error
+
+
 class Network:
     """A participant in a domain of ROS 2, until it is closed."""
 
@@ -105,11 +121,14 @@ class Network:
         self._dds = {name: require(f"cyclonedds.{name}", extra=EXTRA) for name in names}
         self.domain = domain_of() if domain is None else domain
         own, self.reach = configuration_of()
+        before = _sockets()
         with self._our_errors("the network cannot be joined"):
             self._domain = _domain(self.domain, configuration or own or "")
             self._participant = self._dds["domain"].DomainParticipant(self.domain)
             kinds = self._dds["builtin"].BuiltinTopicDcpsPublication
             self._endpoints = self._dds["builtin"].BuiltinDataReader(self._participant, kinds)
+        if own is not None and configuration is None:
+            _keep_inside(_sockets() - before)
         self._readers: list[_Reader] = []
         self._writers: dict[str, Any] = {}
         self._writing, self._reading = threading.Lock(), threading.Lock()
@@ -216,6 +235,35 @@ class _Reader(NamedTuple):
     reader: Any
     condition: Any
     depth: int
+
+
+def _sockets() -> set[int]:
+    """Return the descriptors of the sockets of this process, where the system lists them."""
+    folder = Path("/proc/self/fd")
+    if not folder.is_dir():
+        return set()
+    return {int(one.name) for one in folder.iterdir() if "socket:" in _target(one)}
+
+
+def _target(link: Path) -> str:
+    with suppress(OSError):  # closed meanwhile
+        return str(link.readlink())
+    return ""
+
+
+def _keep_inside(descriptors: set[int]) -> None:
+    """Let sockets hear this machine alone: Cyclone binds them to all interfaces, whatever is set.
+
+    Ref: eclipse-cyclonedds/cyclonedds, issue 2090.
+    """
+    for descriptor in descriptors:
+        with socket.socket(fileno=os.dup(descriptor)) as one:
+            try:
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+            except PermissionError as error:
+                what, expected = "the network cannot be kept on this machine", "Linux 5.7 or later"
+                hint = f"{_RANGE}=SUBNET lets others in"
+                raise SourceError(what, got=error, expected=expected, hint=hint) from error
 
 
 @cache
