@@ -33,6 +33,7 @@ from recon.look.rig import RigFigures
 from recon.map.drive.drive_loops import LoopFigures
 from recon.map.drive.drive_odometry import UsedPrior
 from recon.map.drive.sequence import DriveSegment
+from recon.map.localize.sequence import base_row
 from recon.map.sessions.georeference import SurveyFigures
 from recon.odometry.imu_fit import ImuFigures
 from recon.odometry.sfm import SfmFigures
@@ -101,6 +102,9 @@ class MapSummary(RunSummary):
     rig: RigFigures
     loops: LoopFigures | None = optional()
     imu: ImuFigures | None = optional()
+    base_frame: str | None = (
+        optional()
+    )  # frame of the robot, whose static transforms say where it is
     sfm: SfmFigures | None = optional()
     trajectory: TrajectoryMetrics | None = optional()  # errors, where the truth is known
     map: MapMetrics | None = optional()
@@ -121,7 +125,7 @@ class MapSummary(RunSummary):
             (f"map of {counted(self.frames, 'frame')}{doubted}, {path}",),
             *self.folder_row(),
             *self.made.rows(self.voxel_m),
-            *self._accuracy(),
+            *(self._accuracy() or base_row(self.base_frame)),
             *self.cost_row(*rate, *poses),
             ("next", self.open_view()),
         ]

@@ -12,7 +12,9 @@ from typing import Final, TypeVar, cast
 from recon.core.errors import MappingError, MeshingError, OutputError, SettingsError
 from recon.core.progress import stage
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
+from recon.core.values.arrays import Float64
 from recon.core.work import Stopwatch
+from recon.export.base import on_mounts
 from recon.export.cloud import (
     arrays_product,
     cloud_product,
@@ -95,9 +97,9 @@ class Products:
         return cast("OccupancyGrid", self.made["grid"].value)
 
     @property
-    def camera_height_m(self) -> float | None:
-        """Height of the camera above the ground; None = unknown, or not steady."""
-        return self.figures_of(GridFigures).camera_height_m
+    def T_base_camera(self) -> Float64:
+        """Where the camera is on the vehicle, float64 (4, 4)."""
+        return self.figures_of(GridFigures).T_base_camera
 
     @property
     def mesh(self) -> TriangleMesh | None:
@@ -116,7 +118,7 @@ def make(
     A surface that cannot be made is a warning where something else is asked for.
     """
     made: dict[str, ExportResult] = {}
-    warnings: list[str] = []
+    context, warnings = _grounded(context, products)
     for name in (name for name in PRODUCTS if name in products):
         stage(name)
         try:
@@ -136,7 +138,18 @@ def _written(context: ExportContext, name: str, path: Path) -> ExportResult:
     if PRODUCTS[name].needs_occupancy and not has_occupancy(context.map):
         check_rays(context.map.first, context.placed.tiles.config)
     path.parent.mkdir(parents=True, exist_ok=True)
-    return PRODUCTS[name].write(context, path)
+    made = PRODUCTS[name].write(context, path)
+    if not isinstance(made.figures, GridFigures):
+        return made
+    first = context.map.first
+    T_base_camera = first.T_base_camera(first.T_map_world, made.figures.camera_height_m)
+    return replace(made, figures=replace(made.figures, T_base_camera=T_base_camera))
+
+
+def _grounded(context: ExportContext, products: Sequence[str]) -> tuple[ExportContext, list[str]]:
+    """Let products of the occupancy know how high robots say that the camera is, and its doubts."""
+    wanted = need_rays(products) and has_occupancy(context.map)
+    return on_mounts(context) if wanted else (context, [])
 
 
 def check_target(name: str, path: Path, inputs: Iterable[Path]) -> None:
@@ -160,6 +173,7 @@ def write_product(context: ExportContext, name: str, path: Path) -> ExportResult
     """
     product = PRODUCTS[name]
     stem, end = product.stem_and_suffix(path)
+    context, doubts = _grounded(context, [name])
     with writing_to(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
@@ -170,7 +184,7 @@ def write_product(context: ExportContext, name: str, path: Path) -> ExportResult
                 if not file.exists():  # the largest OctoMaps are not written
                     raise MappingError("; ".join(made.warnings), where=path)
                 file.replace(path.with_name(stem + one))
-    return made
+    return replace(made, warnings=(*doubts, *made.warnings))
 
 
 def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections import defaultdict, deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -45,7 +45,7 @@ from recon.sources.calibration import CALIBRATE, as_rectified, read_rig
 from recon.sources.images import find_partners, partner_names
 from recon.sources.rosbags import Bag
 from recon.sources.settings import SourceSettings
-from recon.sources.source import ReadPrior, Recording, pair_frames
+from recon.sources.source import BASES, Mount, ReadPrior, Recording, pair_frames
 from recon.sources.times import check_increasing, pair_stamps
 
 BAGS: Final = frozenset({".bag", ".mcap", ".db3"})
@@ -86,6 +86,10 @@ class BagSource(Recording):
         if name is None:
             return None
         return read_imu_topic(self.bag, name, self.topics[0], stamped=self.stamped)
+
+    def read_mount(self) -> Mount | None:
+        with reading(self.bag.paths[0]):
+            return find_mount(_static_edges(self.bag), self.bag.frame_id(self.topics[0]))
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         if start >= len(self):
@@ -290,6 +294,7 @@ def _camera(info: BagCameraInfo, where: Path) -> CameraIntrinsics:
 
 
 _STATIC: Final = "tf_static"
+_UNIT: Final = 1e-2  # off length 1, from which tf2 ignores a quaternion
 _ODOMETRY: Final = "odom"  # the frame in which wheels and inertial units measure, by REP 105
 
 
@@ -309,7 +314,8 @@ def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadP
             raise FormatError("pose is not finite, or has no rotation", where=where)
     path = Trajectory(np.stack([_transform(poses[index]) for index in first]), times_ns * NS)
     camera = bag.frame_id(image_topic)
-    T_child_camera = _static_transform(bag, child, camera)
+    with reading(bag.paths[0]):
+        T_child_camera = static_transform(_static_edges(bag), child, camera)
     origin = f"{name}, {counted(len(path), 'pose')} of {child or 'an unnamed frame'} in {parent}"
     if T_child_camera is None:
         return ReadPrior(path, f"{origin}, no static transform to {camera or 'the camera'}")
@@ -332,7 +338,9 @@ def read_imu_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> I
     columns = [int(stamped), *range(2, 8)]
     places = [f"{name}, message {n}" for n in range(len(table))]
     record = imu_of(table[:, columns], places, where)
-    T_imu_camera = _static_transform(bag, bag.frame_id(name), bag.frame_id(image_topic))
+    with reading(bag.paths[0]):
+        names = bag.frame_id(name), bag.frame_id(image_topic)
+        T_imu_camera = static_transform(_static_edges(bag), *names)
     if T_imu_camera is not None:
         return replace(record, T_camera_imu=invert(T_imu_camera))
     note = f"IMU: no static transform from {name} to the camera: its axes are what the drive shows"
@@ -359,22 +367,67 @@ def _transform(pose: BagPose) -> Float64:
     return make_transform(rotation_from_quaternion(pose.xyzw), pose.xyz_m)
 
 
-def _static_transform(bag: Bag, start: str, goal: str) -> Float64 | None:
-    """Return T_start_goal by the static transforms of a recording; None = they do not connect."""
+def static_transform(edges: Iterable[BagPose], start: str, goal: str) -> Float64 | None:
+    """Return T_start_goal, float64 (4, 4), by static transforms; None = they do not connect.
+
+    The way has as few steps as can be, whoever is the parent in a step. Of contradictions between
+    two frames the last one counts, as in tf. A transform on the way that is none is a
+    `FormatError`; others are not looked at.
+    """
+    steps: dict[str, dict[str, BagPose]] = defaultdict(dict)
+    for edge in _slashless(edges):
+        steps[edge.parent][edge.child] = steps[edge.child][edge.parent] = edge
+    start, goal = start.lstrip("/"), goal.lstrip("/")
+    ways, waiting = {start: list[str]()}, deque([start])
+    while waiting and goal not in ways:
+        here = waiting.popleft()
+        near = [there for there in steps[here] if there not in ways]
+        ways |= {there: [*ways[here], there] for there in near}
+        waiting.extend(near)
+    if not start or not goal or goal not in ways:
+        return None
+    T_start_here, here = np.eye(4), start
+    for there in ways[goal]:
+        edge = steps[here][there]
+        T_parent_child = _rigid(edge)
+        step = T_parent_child if edge.child == there else invert(T_parent_child)
+        T_start_here, here = T_start_here @ step, there
+    return T_start_here
+
+
+def _rigid(edge: BagPose) -> Float64:
+    norm = float(np.linalg.norm(edge.xyzw))
+    if not (np.isfinite(edge.xyz_m).all() and abs(norm - 1.0) <= _UNIT):
+        what = f"the static transform from {edge.parent} to {edge.child} is no motion"
+        got = f"position {edge.xyz_m.tolist()}, quaternion {edge.xyzw.tolist()}"
+        raise FormatError(what, got=got, expected="finite numbers, a quaternion of length 1")
+    return _transform(edge)
+
+
+def find_mount(edges: Iterable[BagPose], camera: str) -> Mount | None:
+    """Return where the frame of the left images is on a robot; None = nothing connects them.
+
+    On a robot with both, its base is ``base_footprint``, on the ground, and not ``base_link``;
+    names may have a prefix that ends in a slash. Errors are those of `static_transform`.
+    """
+    known, camera = _slashless(edges), camera.lstrip("/")
+    names = sorted({name for edge in known for name in (edge.parent, edge.child)} - {camera})
+    for last in BASES:
+        for base in (name for name in names if name.rpartition("/")[2] == last):
+            T_base_camera = static_transform(known, base, camera)
+            if T_base_camera is not None:
+                return Mount(T_base_camera, base, camera)
+    return None
+
+
+def _slashless(edges: Iterable[BagPose]) -> list[BagPose]:
+    """Return edges with names as ROS 2 writes them; those of ROS 1 may begin with a slash."""
+    return [e._replace(parent=e.parent.lstrip("/"), child=e.child.lstrip("/")) for e in edges]
+
+
+def _static_edges(bag: Bag) -> list[BagPose]:
     topics = [t.name for t in bag.topics.values() if t.kind in TRANSFORMS and _STATIC in t.name]
-    steps: dict[str, dict[str, Float64]] = defaultdict(dict)
-    for pose in (pose for topic in topics for pose in bag.poses(topic)):
-        T_parent_child = _transform(pose)
-        steps[pose.parent][pose.child] = T_parent_child
-        steps[pose.child][pose.parent] = invert(T_parent_child)
-    reached, waiting = {start: np.eye(4)}, [start]
-    while waiting:
-        here = waiting.pop()
-        for there, T_here_there in steps[here].items():
-            if there not in reached:
-                reached[there] = reached[here] @ T_here_there
-                waiting.append(there)
-    return reached.get(goal) if start and goal else None
+    return [pose for topic in topics for pose in bag.poses(topic)]
 
 
 def read_measured(path: Path) -> Positions:

@@ -13,7 +13,7 @@ import numpy as np
 from recon.core.errors import MappingError, RegistrationError
 from recon.core.progress import series, stage
 from recon.core.settings import scaled
-from recon.core.summary import Figures, Rows, RunSummary, inline
+from recon.core.summary import Figures, Rows, RunSummary, inline, optional
 from recon.core.text import counted, metres
 from recon.core.values import OccupancyGrid, Recorded, Trajectory
 from recon.core.values.arrays import Bool, Float64
@@ -243,6 +243,12 @@ def localize_sequence(
     return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
 
 
+def base_row(base_frame: str | None) -> Rows:
+    """Return the line of which robot's base a path is known of, if it is one."""
+    said = f"{base_frame}, by the robot's static transforms"
+    return [] if base_frame is None else [("base", "trajectory_map_base_tum.txt", said)]
+
+
 @dataclass(frozen=True, kw_only=True)
 class LocalizeSummary(RunSummary):
     """What `recon localize` found."""
@@ -252,6 +258,9 @@ class LocalizeSummary(RunSummary):
     T_map_world: Float64  # (4, 4)
     drive: LocalizedFigures = inline()
     rig: RigFigures
+    base_frame: str | None = (
+        optional()
+    )  # frame of the robot, whose static transforms say where it is
     read: SourceFigures = inline()
 
     def rows(self) -> Rows:
@@ -267,6 +276,7 @@ class LocalizeSummary(RunSummary):
             *self.folder_row(),
             ("poses", "trajectory_tum.txt", where + sure),
             ("others", f"{left}; lost {counted(found.frames_lost, 'time')}"),
+            *base_row(self.base_frame),
             *self.cost_row(f"95 % of frames in {ms:.0f} ms"),
             ("next", self.open_view()),
         ]

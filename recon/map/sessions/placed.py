@@ -43,7 +43,8 @@ class PlacedMap:
     """What the drives of a map that share its axes observed, in tiles."""
 
     tiles: Tiles
-    # float64 (N, 3), positions of the camera, map axes; a row of NaN between two drives
+    # float64 (N, 3), positions of the camera, or as high above the base of its robot if that is
+    # known, map axes; a row of NaN between two drives
     path_m: Float64
     trusted: Bool  # (N,), which of them are to be trusted, and have a place in the map
 
@@ -220,7 +221,15 @@ def _with_path(map_: MapFile, settings: DriveSettings, tiles: Tiles) -> PlacedMa
         if paths:  # a row between two drives
             paths.append(np.full((1, 3), np.nan))
             good.append(np.zeros(1, np.bool_))
-        paths.append(apply(session.T_map_world, session.trajectory.positions_m))
+        path, beside_m = session.trajectory, np.zeros(3)
+        if session.mount is not None:
+            R_base_camera, off_m = (
+                session.mount.T_base_camera[:3, :3],
+                session.mount.T_base_camera[:3, 3],
+            )
+            beside_m = -R_base_camera.T @ (off_m * (1.0, 1.0, 0.0))
+        path_m = path.positions_m + path.T_world_camera[:, :3, :3] @ beside_m
+        paths.append(apply(session.T_map_world, path_m))
         good.append(placed[session.number])
     return PlacedMap(tiles, np.concatenate(paths), np.concatenate(good))
 

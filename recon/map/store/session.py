@@ -17,6 +17,7 @@ from recon.io.files import reading
 from recon.look.rig import KnownRig, RefinedRig
 from recon.map.builders import Submap
 from recon.map.fusion import KNOWABLE, row_bytes
+from recon.map.ground.axes import base_axes
 from recon.map.store.records import Store
 from recon.map.store.trees import (
     FRAMES,
@@ -40,6 +41,7 @@ from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
 from recon.places.places import Loop
 from recon.places.pose_graph import NO_FIXES, Fixes
+from recon.sources.source import Mount
 
 SESSION: Final = "session"
 AXES: Final = "axes"
@@ -70,7 +72,11 @@ class SessionInfo:
 
 
 class Session:
-    """One drive in a map; the next commit of the map keeps what is added."""
+    """One drive in a map; the next commit of the map keeps what is added.
+
+    ``mount`` is where the rectified left camera is on its robot, which is kept with the axes; None
+    = nothing says so.
+    """
 
     def __init__(self, store: Store, number: int) -> None:
         self._store = store
@@ -87,6 +93,10 @@ class Session:
                 for T, time_s, health in frames_in(store.read(FRAMES, (number, first))):
                     self.add_frame(T, time_s, health)
             self._flushed = len(self)
+            axes = store.get(AXES, number) if store.has(AXES, number) else {}
+            self.mount = value_in(Mount, axes["mount"]) if "mount" in axes else None
+            if self.mount is not None:
+                check_rigid("T_base_camera", self.mount.T_base_camera)
             if sorted(self._times_s) != self._times_s:
                 raise FormatError("frames of the drive are not in order")
             for name in (OPTIMISED_POSES, POSES_BEFORE_LINKS):
@@ -187,7 +197,13 @@ class Session:
 
     def set_axes(self, T_map_world: Float64, camera: RectifiedCamera) -> None:
         content = {"T_map_world": T_map_world, "camera": asdict(camera)}
-        self._store.put(AXES, self.number, content)
+        mounted = {} if self.mount is None else {"mount": asdict(self.mount)}
+        self._store.put(AXES, self.number, content | mounted)
+
+    def T_base_camera(self, T_map_world: Float64, camera_height_m: float | None) -> Float64:
+        """Return where the camera is on its vehicle, as a robot says, else by `base_axes`."""
+        mount = self.mount
+        return base_axes(T_map_world, camera_height_m) if mount is None else mount.T_base_camera
 
     @property
     def rig(self) -> KnownRig | None:
