@@ -104,8 +104,7 @@ def run_localize(
         made = LocalizeResult(source.name, str(map_path), drive, grid, summary)
         with run.stage("write"):
             height_m = None if folder is None else figure_of(folder, "camera_height_m")
-            below = base_axes(map_.first.T_map_world, height_m)
-            T_base_camera = below if mount is None else mount.T_base_camera
+            T_base_camera = base_axes(drive.T_map_world, height_m, mount)
             export_localized(drive, T_base_camera, run.content)
             write_states(run.path(STATES), drive.frames)
         with run.report(summary) as summary:

@@ -33,7 +33,6 @@ from recon.look.rig import RigFigures
 from recon.map.drive.drive_loops import LoopFigures
 from recon.map.drive.drive_odometry import UsedPrior
 from recon.map.drive.sequence import DriveSegment
-from recon.map.localize.sequence import base_row
 from recon.map.sessions.georeference import SurveyFigures
 from recon.odometry.imu_fit import ImuFigures
 from recon.odometry.sfm import SfmFigures
@@ -125,7 +124,7 @@ class MapSummary(RunSummary):
             (f"map of {counted(self.frames, 'frame')}{doubted}, {path}",),
             *self.folder_row(),
             *self.made.rows(self.voxel_m),
-            *(self._accuracy() or base_row(self.base_frame)),
+            *(self._accuracy() or self._base()),
             *self.cost_row(*rate, *poses),
             ("next", self.open_view()),
         ]
@@ -139,6 +138,10 @@ class MapSummary(RunSummary):
             near = f"within {surface.threshold_m:g} m"
             parts.append(f"{100 * surface.precision:.0f} % of the points {near}")
         return [("accuracy", "; ".join(parts))] if parts else []
+
+    def _base(self) -> Rows:
+        said = f"{self.base_frame}, by the robot's static transforms"
+        return [] if self.base_frame is None else [("base", "trajectory_map_base_tum.txt", said)]
 
 
 @dataclass(frozen=True, kw_only=True)

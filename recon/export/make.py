@@ -9,12 +9,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, TypeVar, cast
 
+import numpy as np
+
 from recon.core.errors import MappingError, MeshingError, OutputError, SettingsError
 from recon.core.progress import stage
+from recon.core.text import metres
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
 from recon.core.values.arrays import Float64
 from recon.core.work import Stopwatch
-from recon.export.base import on_mounts
 from recon.export.cloud import (
     arrays_product,
     cloud_product,
@@ -34,7 +36,9 @@ from recon.export.product import ExportContext, ExportResult, Product, ProductFi
 from recon.export.rasters import RASTERS, raster_product, stem_of
 from recon.io.atomic import check_targets, writing_to
 from recon.io.models.mesh import MESH_SUFFIXES
-from recon.map.sessions.placed import check_rays, has_occupancy
+from recon.map.ground.axes import base_axes
+from recon.map.ground.surface import BIN_M, add_floors, measure_camera_height
+from recon.map.sessions.placed import PlacedMap, check_rays, has_occupancy
 
 # In the order in which they are made.
 PRODUCTS: Final[Mapping[str, Product]] = {
@@ -67,6 +71,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
 FORMER_PRODUCTS: Final = {"occupancy": "grid-geotiff"}  # before 1.0
 USUAL: Final = ("cloud", "octomap", "grid", "mesh")  # unless something else is asked for
 OF_A_PAIR: Final = ("cloud", "mesh")
+_DOUBTED: Final = 2.0  # standard deviations between two heights, of which one is wrong then
 F = TypeVar("F", bound=ProductFigures)
 
 
@@ -118,7 +123,7 @@ def make(
     A surface that cannot be made is a warning where something else is asked for.
     """
     made: dict[str, ExportResult] = {}
-    context, warnings = _grounded(context, products)
+    warnings: list[str] = []
     for name in (name for name in PRODUCTS if name in products):
         stage(name)
         try:
@@ -135,21 +140,53 @@ def make(
 
 
 def _written(context: ExportContext, name: str, path: Path) -> ExportResult:
-    if PRODUCTS[name].needs_occupancy and not has_occupancy(context.map):
-        check_rays(context.map.first, context.placed.tiles.config)
+    first, doubts = context.map.first, []
+    if PRODUCTS[name].needs_occupancy:
+        if not has_occupancy(context.map):
+            check_rays(first, context.placed.tiles.config)
+        doubts = _stand_on_mounts(context)
     path.parent.mkdir(parents=True, exist_ok=True)
     made = PRODUCTS[name].write(context, path)
-    if not isinstance(made.figures, GridFigures):
-        return made
-    first = context.map.first
-    T_base_camera = first.T_base_camera(first.T_map_world, made.figures.camera_height_m)
-    return replace(made, figures=replace(made.figures, T_base_camera=T_base_camera))
+    if isinstance(figures := made.figures, GridFigures):
+        T_base_camera = base_axes(first.T_map_world, figures.camera_height_m, first.mount)
+        made = replace(made, figures=replace(figures, T_base_camera=T_base_camera))
+    return replace(made, warnings=[*doubts, *made.warnings])
 
 
-def _grounded(context: ExportContext, products: Sequence[str]) -> tuple[ExportContext, list[str]]:
-    """Let products of the occupancy know how high robots say that the camera is, and its doubts."""
-    wanted = need_rays(products) and has_occupancy(context.map)
-    return on_mounts(context) if wanted else (context, [])
+def _stand_on_mounts(context: ExportContext) -> list[str]:
+    """Let products be made with the height of the camera that all robots state; return doubts.
+
+    A height that is set wins over it; so does the ground that was seen, where it contradicts it.
+    """
+    tiles, mounts = context.placed.tiles, [one.mount for one in context.map.linked]
+    ground = tiles.config.ground
+    height_m, *others = {None if one is None else one.camera_height_m for one in mounts}
+    if height_m is None or others or ground.camera_height_m is not None:
+        return []
+    seen_m, sigma_m = _seen_height(context.placed)
+    if abs(seen_m - height_m) > _DOUBTED * np.hypot(sigma_m, BIN_M):
+        said = f"the static transforms put the camera {metres(height_m)} above the ground"
+        return [f"{said}, and it is {metres(seen_m)} ± {metres(sigma_m)}, which the grid follows"]
+    known = ground.model_copy(update={"camera_height_m": height_m})
+    tiles.config = tiles.config.model_copy(update={"ground": known})
+    return []
+
+
+def _seen_height(placed: PlacedMap) -> tuple[float, float]:
+    """Return the height of the camera above what was seen below its path, and its spread, or NaN.
+
+    Errors of neighbouring places are alike: many places are not surer than one.
+    """
+    tiles, drops = placed.tiles, [np.zeros(0)]
+    for area in (tiles.bounds(tile.key) for tile in tiles):
+        if len(path_m := area.path(placed.path_m)):
+            points = add_floors(tiles.cloud_in(area), tiles.floors_in(area))
+            reach_m = tiles.config.occupancy.max_range_m
+            drops.append(measure_camera_height(points, path_m, reach_m)[1])
+    if not len(drops_m := np.concatenate(drops)):
+        return np.nan, np.nan
+    middle_m = float(np.median(drops_m))
+    return middle_m, 1.4826 * float(np.median(np.abs(drops_m - middle_m)))
 
 
 def check_target(name: str, path: Path, inputs: Iterable[Path]) -> None:
@@ -173,7 +210,6 @@ def write_product(context: ExportContext, name: str, path: Path) -> ExportResult
     """
     product = PRODUCTS[name]
     stem, end = product.stem_and_suffix(path)
-    context, doubts = _grounded(context, [name])
     with writing_to(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f".{path.name}-", dir=path.parent) as folder:
@@ -184,7 +220,7 @@ def write_product(context: ExportContext, name: str, path: Path) -> ExportResult
                 if not file.exists():  # the largest OctoMaps are not written
                     raise MappingError("; ".join(made.warnings), where=path)
                 file.replace(path.with_name(stem + one))
-    return replace(made, warnings=(*doubts, *made.warnings))
+    return made
 
 
 def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:

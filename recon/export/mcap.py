@@ -19,6 +19,7 @@ from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
 from recon.io.ros.bag import RosBag, write_bag
 from recon.io.ros.messages import grid_message, header, points, pose, transforms
+from recon.map.ground.axes import base_axes
 from recon.map.store.session import Session
 from recon.places.closure import USUAL, DrivePath
 from recon.places.places import spread_over
@@ -75,7 +76,8 @@ class _Drive:
         # Of its topics and frames, with a slash.
         self.name = f"drive{session.number}/" if len(context.map.linked) > 1 else ""
         self.base = f"{self.name}{'base_link' if session.mount is None else session.mount.base}"
-        self._T_base_camera = session.T_base_camera(context.map.first.T_map_world, height_m)
+        T_map_world = context.map.first.T_map_world
+        self._T_base_camera = base_axes(T_map_world, height_m, session.mount)
         path = session.trajectory
         if not (path.timestamps_s[0] >= 0.0 and path.timestamps_s[-1] < 2.0**31):
             what, got = "times of the frames do not fit into a bag", f"{path.timestamps_s[0]:g} s"

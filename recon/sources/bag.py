@@ -370,59 +370,44 @@ def _transform(pose: BagPose) -> Float64:
 def static_transform(edges: Iterable[BagPose], start: str, goal: str) -> Float64 | None:
     """Return T_start_goal, float64 (4, 4), by static transforms; None = they do not connect.
 
-    The way has as few steps as can be, whoever is the parent in a step. Of contradictions between
-    two frames the last one counts, as in tf. A transform on the way that is none is a
-    `FormatError`; others are not looked at.
+    The way has as few steps as can be. Of what is said of two frames the last counts, and what is
+    no motion does not, as in tf; where nothing else leads to the goal, it is a `FormatError`.
     """
-    steps: dict[str, dict[str, BagPose]] = defaultdict(dict)
-    for edge in _slashless(edges):
-        steps[edge.parent][edge.child] = steps[edge.child][edge.parent] = edge
+    steps: dict[str, dict[str, Float64]] = defaultdict(dict)
+    broken = []
+    for edge in edges:
+        unit = abs(float(np.linalg.norm(edge.xyzw)) - 1.0) <= _UNIT
+        if not (unit and np.isfinite(edge.xyz_m).all()):
+            broken.append(f"{edge.parent} to {edge.child}, {edge.xyz_m}, {edge.xyzw}")
+            continue
+        steps[edge.parent][edge.child] = _transform(edge)
+        steps[edge.child][edge.parent] = invert(_transform(edge))
     start, goal = start.lstrip("/"), goal.lstrip("/")
-    ways, waiting = {start: list[str]()}, deque([start])
-    while waiting and goal not in ways:
+    reached, waiting = {start: np.eye(4)}, deque([start])
+    while waiting:
         here = waiting.popleft()
-        near = [there for there in steps[here] if there not in ways]
-        ways |= {there: [*ways[here], there] for there in near}
-        waiting.extend(near)
-    if not start or not goal or goal not in ways:
-        return None
-    T_start_here, here = np.eye(4), start
-    for there in ways[goal]:
-        edge = steps[here][there]
-        T_parent_child = _rigid(edge)
-        step = T_parent_child if edge.child == there else invert(T_parent_child)
-        T_start_here, here = T_start_here @ step, there
-    return T_start_here
-
-
-def _rigid(edge: BagPose) -> Float64:
-    norm = float(np.linalg.norm(edge.xyzw))
-    if not (np.isfinite(edge.xyz_m).all() and abs(norm - 1.0) <= _UNIT):
-        what = f"the static transform from {edge.parent} to {edge.child} is no motion"
-        got = f"position {edge.xyz_m.tolist()}, quaternion {edge.xyzw.tolist()}"
-        raise FormatError(what, got=got, expected="finite numbers, a quaternion of length 1")
-    return _transform(edge)
+        for there, T_here_there in steps[here].items():
+            if there not in reached:
+                reached[there] = reached[here] @ T_here_there
+                waiting.append(there)
+    if goal not in reached and broken:
+        what, expected = "a static transform is no motion", "a quaternion of length 1"
+        raise FormatError(what, got=broken[0], expected=f"finite numbers, {expected}")
+    return reached.get(goal) if start and goal else None
 
 
 def find_mount(edges: Iterable[BagPose], camera: str) -> Mount | None:
     """Return where the frame of the left images is on a robot; None = nothing connects them.
 
-    On a robot with both, its base is ``base_footprint``, on the ground, and not ``base_link``;
-    names may have a prefix that ends in a slash. Errors are those of `static_transform`.
+    Its base is ``base_footprint``, on the ground, or else ``base_link``, with any prefix that ends
+    in a slash. Errors are those of `static_transform`.
     """
-    known, camera = _slashless(edges), camera.lstrip("/")
+    known, camera = list(edges), camera.lstrip("/")
     names = sorted({name for edge in known for name in (edge.parent, edge.child)} - {camera})
-    for last in BASES:
-        for base in (name for name in names if name.rpartition("/")[2] == last):
-            T_base_camera = static_transform(known, base, camera)
-            if T_base_camera is not None:
-                return Mount(T_base_camera, base, camera)
+    for base in (name for last in BASES for name in names if name.rpartition("/")[2] == last):
+        if (T_base_camera := static_transform(known, base, camera)) is not None:
+            return Mount(T_base_camera, base, camera)
     return None
-
-
-def _slashless(edges: Iterable[BagPose]) -> list[BagPose]:
-    """Return edges with names as ROS 2 writes them; those of ROS 1 may begin with a slash."""
-    return [e._replace(parent=e.parent.lstrip("/"), child=e.child.lstrip("/")) for e in edges]
 
 
 def _static_edges(bag: Bag) -> list[BagPose]:

@@ -31,10 +31,8 @@ class ReadPrior:
     origin: str
 
 
-_ON_GROUND: Final = "base_footprint"
-BASES: Final = (_ON_GROUND, "base_link")
-"""Last parts of the names that the base of a robot has, the most telling one first (REP 120, REP
-105)."""
+BASES: Final = ("base_footprint", "base_link")
+"""How the name of a robot's base ends: on the ground (REP 120), or anywhere on it (REP 105)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +54,7 @@ class Mount:
     def camera_height_m(self) -> float | None:
         """Height of the camera above the ground; None = the base may be anywhere above it."""
         height_m = float(self.T_base_camera[2, 3])
-        return height_m if self.base.rpartition("/")[2] == _ON_GROUND and height_m > 0 else None
+        return height_m if self.base.rpartition("/")[2] == BASES[0] and height_m > 0 else None
 
 
 @dataclass(frozen=True)

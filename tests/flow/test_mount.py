@@ -147,8 +147,10 @@ def test_the_height_of_a_base_link_is_measured(mapped):
 def test_a_height_that_the_ground_contradicts_is_said(mapped):
     raised = make_transform(T_FOOTPRINT_CAM[:3, :3], np.array([0.3, 0.0, HEIGHT_M + 0.25]))
     summary = summary_of(mapped("raised", base_footprint__cam=raised))
-    (said,) = [text for text in summary["warnings"] if "base_footprint" in text]
-    assert said.startswith("the camera is 1.35 m above base_footprint by the robot's transforms")
+    (said,) = [text for text in summary["warnings"] if "static transforms" in text]
+    assert said.startswith(
+        "the static transforms put the camera 1.35 m above the ground, and it is"
+    )
     assert summary["camera_height_m"] == pytest.approx(HEIGHT_M, abs=0.05)
     np.testing.assert_allclose(summary["T_base_camera"], raised, atol=1e-12)
 

@@ -48,9 +48,10 @@ def test_transforms_are_joined_both_ways_along_the_tree():
         # Who said it last is right, also the other way round.
         ([edge("a", "c", B), edge("a", "c", A)], A),
         ([edge("a", "c", B), edge("c", "a", A)], invert(A)),
-        ([edge("/a", "//c", A)], A),
+        ([edge("a", "c", A)], A),
         # What is broken elsewhere does not matter.
         ([edge("a", "c"), edge("a", "x", xyzw=np.zeros(4)), edge("x", "c")], A),
+        ([edge("a", "c"), edge("a", "c", xyzw=np.full(4, np.nan))], A),
     ],
 )
 def test_a_tree_that_is_none_still_leads_from_frame_to_frame(edges, expected):
@@ -68,7 +69,7 @@ def test_a_tree_that_is_none_still_leads_from_frame_to_frame(edges, expected):
 )
 def test_a_transform_that_is_no_motion_is_one_line(broken):
     edges = [edge("base_link", "mast", A), edge("mast", "cam", **broken)]
-    with pytest.raises(FormatError, match="from mast to cam is no motion") as caught:
+    with pytest.raises(FormatError, match=r"no motion .*mast to cam") as caught:
         find_mount(edges, "cam")
     assert "\n" not in str(caught.value)
 
@@ -128,6 +129,6 @@ def test_the_mount_is_of_the_rectified_view_of_a_raw_camera():
     source.read_mount = lambda: find_mount([edge("base_link", "cam", xyzw=np.zeros(4))], "cam")
     found, (said,) = mount_of(source, RectificationSettings())
     assert found is None
-    assert said.startswith("transforms of the robot not used: the static transform from base_link")
+    assert said.startswith("transforms of the robot not used: a static transform is no motion")
     for other in (SourcePart(Raw(), 0, 2), LiveSource(Raw())):
         np.testing.assert_array_equal(other.read_mount().T_base_camera, A)

@@ -13,6 +13,7 @@ from recon.core.geometry.se3 import exp_so3, make_transform, transform_cloud
 from recon.core.settings import Settings
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64, freeze
+from recon.sources.source import Mount
 
 AXES_MAP_WORLD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The turn from camera-like axes (right, down, forward) to map axes (forward, left, up)."""
@@ -75,8 +76,8 @@ def map_axes(
     plane.
     """
     turn = AXES_MAP_WORLD if R_base_world is None else R_base_world
-    tilted = ground is not None and ground.tilt_deg > _MIN_TILT_DEG
-    if up is None and R_base_world is None and ground is not None and tilted:
+    free = up is None and R_base_world is None
+    if free and ground is not None and ground.tilt_deg > _MIN_TILT_DEG:
         up = ground.normal
     if up is not None:
         turn = _short_turn(turn @ up, np.array([0.0, 0.0, 1.0])) @ turn
@@ -102,12 +103,16 @@ def _short_turn(first: Float64, second: Float64) -> Float64:
     return exp_so3(axis / size * angle)
 
 
-def base_axes(T_map_world: Float64, camera_height_m: float | None) -> Float64:
+def base_axes(
+    T_map_world: Float64, camera_height_m: float | None, mount: Mount | None = None
+) -> Float64:
     """Return ``T_base_camera``, from the left camera to the base of the vehicle (`base_link`).
 
-    The base has the axes of the map in the first frame (x forward, y left, z up), and its origin on
-    the ground below the camera; in the camera where its height is not known (None).
+    Without a ``mount``, the base has the axes of the map in the first frame (x forward, y left, z
+    up), and its origin on the ground below the camera; in the camera where its height is not known.
     """
+    if mount is not None:
+        return mount.T_base_camera
     return make_transform(T_map_world[:3, :3], np.array([0.0, 0.0, camera_height_m or 0.0]))
 
 

@@ -243,12 +243,6 @@ def localize_sequence(
     return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
 
 
-def base_row(base_frame: str | None) -> Rows:
-    """Return the line of which robot's base a path is known of, if it is one."""
-    said = f"{base_frame}, by the robot's static transforms"
-    return [] if base_frame is None else [("base", "trajectory_map_base_tum.txt", said)]
-
-
 @dataclass(frozen=True, kw_only=True)
 class LocalizeSummary(RunSummary):
     """What `recon localize` found."""
@@ -276,7 +270,6 @@ class LocalizeSummary(RunSummary):
             *self.folder_row(),
             ("poses", "trajectory_tum.txt", where + sure),
             ("others", f"{left}; lost {counted(found.frames_lost, 'time')}"),
-            *base_row(self.base_frame),
             *self.cost_row(f"95 % of frames in {ms:.0f} ms"),
             ("next", self.open_view()),
         ]

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import FormatError, MappingError, SettingsError
-from recon.core.geometry.se3 import apply
+from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RayCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import side_by_side
@@ -221,15 +221,11 @@ def _with_path(map_: MapFile, settings: DriveSettings, tiles: Tiles) -> PlacedMa
         if paths:  # a row between two drives
             paths.append(np.full((1, 3), np.nan))
             good.append(np.zeros(1, np.bool_))
-        path, beside_m = session.trajectory, np.zeros(3)
-        if session.mount is not None:
-            R_base_camera, off_m = (
-                session.mount.T_base_camera[:3, :3],
-                session.mount.T_base_camera[:3, 3],
-            )
-            beside_m = -R_base_camera.T @ (off_m * (1.0, 1.0, 0.0))
-        path_m = path.positions_m + path.T_world_camera[:, :3, :3] @ beside_m
-        paths.append(apply(session.T_map_world, path_m))
+        path, mount = session.trajectory, session.mount
+        paths.append(apply(session.T_map_world, path.positions_m))
+        if mount is not None:
+            T = session.T_map_world @ path.T_world_camera @ invert(mount.T_base_camera)
+            paths[-1] = T[:, :3, 3] + mount.T_base_camera[2, 3] * T[:, :3, 2]
         good.append(placed[session.number])
     return PlacedMap(tiles, np.concatenate(paths), np.concatenate(good))
 

@@ -17,7 +17,6 @@ from recon.io.files import reading
 from recon.look.rig import KnownRig, RefinedRig
 from recon.map.builders import Submap
 from recon.map.fusion import KNOWABLE, row_bytes
-from recon.map.ground.axes import base_axes
 from recon.map.store.records import Store
 from recon.map.store.trees import (
     FRAMES,
@@ -199,11 +198,6 @@ class Session:
         content = {"T_map_world": T_map_world, "camera": asdict(camera)}
         mounted = {} if self.mount is None else {"mount": asdict(self.mount)}
         self._store.put(AXES, self.number, content | mounted)
-
-    def T_base_camera(self, T_map_world: Float64, camera_height_m: float | None) -> Float64:
-        """Return where the camera is on its vehicle, as a robot says, else by `base_axes`."""
-        mount = self.mount
-        return base_axes(T_map_world, camera_height_m) if mount is None else mount.T_base_camera
 
     @property
     def rig(self) -> KnownRig | None:
