@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, TypeVar, cast
@@ -31,14 +32,14 @@ from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
 from recon.export.mesh.texture import texture_product
 from recon.export.nerfstudio import nerfstudio_product
-from recon.export.occupancy import GridFigures, grid_product, octomap_product
+from recon.export.occupancy import Flattening, GridFigures, grid_product, octomap_product
 from recon.export.product import ExportContext, ExportResult, Product, ProductFigures
 from recon.export.rasters import RASTERS, raster_product, stem_of
 from recon.io.atomic import check_targets, writing_to
 from recon.io.models.mesh import MESH_SUFFIXES
 from recon.map.ground.axes import base_axes
-from recon.map.ground.surface import BIN_M, add_floors, measure_camera_height
-from recon.map.sessions.placed import PlacedMap, check_rays, has_occupancy
+from recon.map.ground.surface import BIN_M
+from recon.map.sessions.placed import check_rays, has_occupancy
 
 # In the order in which they are made.
 PRODUCTS: Final[Mapping[str, Product]] = {
@@ -158,35 +159,22 @@ def _stand_on_mounts(context: ExportContext) -> list[str]:
 
     A height that is set wins over it; so does the ground that was seen, where it contradicts it.
     """
-    tiles, mounts = context.placed.tiles, [one.mount for one in context.map.linked]
-    ground = tiles.config.ground
+    placed, mounts = context.placed, [one.mount for one in context.map.linked]
+    config, ground = placed.tiles.config, placed.tiles.config.ground
     height_m, *others = {None if one is None else one.camera_height_m for one in mounts}
     if height_m is None or others or ground.camera_height_m is not None:
         return []
-    seen_m, sigma_m = _seen_height(context.placed)
-    if abs(seen_m - height_m) > _DOUBTED * np.hypot(sigma_m, BIN_M):
-        said = f"the static transforms put the camera {metres(height_m)} above the ground"
-        return [f"{said}, and it is {metres(seen_m)} ± {metres(sigma_m)}, which the grid follows"]
+    for _, surface in islice(Flattening(placed).grounds(), 1):
+        seen_m = surface.camera_height_m  # along the whole path
+        off_m = np.abs(surface.drop_at(placed.path_m[:, :2]) - seen_m)
+        sigma_m = 1.4826 * float(np.nanmedian(np.append(off_m, 0.0)))  # of a normal distribution
+        if abs(seen_m - height_m) > _DOUBTED * np.hypot(sigma_m, BIN_M):
+            said = f"the static transforms put the camera {metres(height_m)} above the ground"
+            seen = f"{metres(seen_m)} ± {metres(sigma_m)}"
+            return [f"{said}, and it is {seen}, which the grid follows"]
     known = ground.model_copy(update={"camera_height_m": height_m})
-    tiles.config = tiles.config.model_copy(update={"ground": known})
+    placed.tiles.config = config.model_copy(update={"ground": known})
     return []
-
-
-def _seen_height(placed: PlacedMap) -> tuple[float, float]:
-    """Return the height of the camera above what was seen below its path, and its spread, or NaN.
-
-    Errors of neighbouring places are alike: many places are not surer than one.
-    """
-    tiles, drops = placed.tiles, [np.zeros(0)]
-    for area in (tiles.bounds(tile.key) for tile in tiles):
-        if len(path_m := area.path(placed.path_m)):
-            points = add_floors(tiles.cloud_in(area), tiles.floors_in(area))
-            reach_m = tiles.config.occupancy.max_range_m
-            drops.append(measure_camera_height(points, path_m, reach_m)[1])
-    if not len(drops_m := np.concatenate(drops)):
-        return np.nan, np.nan
-    middle_m = float(np.median(drops_m))
-    return middle_m, 1.4826 * float(np.median(np.abs(drops_m - middle_m)))
 
 
 def check_target(name: str, path: Path, inputs: Iterable[Path]) -> None:
