@@ -157,7 +157,7 @@ def run_map(
             warnings=warnings,
         )
         with run.stage("write"):
-            export_paths(map_.first, mapped.joined, made.camera_height_m, run.content)
+            export_paths(map_.first, mapped.joined, made.T_base_camera, run.content)
             keep_map(map_, run.path(MAP_FILE))
         with run.report(summary) as summary:
             # Its figures take long to load, and the drive is mapped without them.
@@ -325,6 +325,7 @@ def _warnings(
         *(() if drift is None else drift.warnings()),
         *(() if mapped.prior is None else mapped.prior.warnings()),
         *(() if mapped.imu is None else mapped.imu.lines),
+        *mapped.doubts,
         *(() if mapped.loops is None else mapped.loops.warnings()),
     ]
 
@@ -363,6 +364,7 @@ def _summary(
         rig=rig.figures(),
         loops=None if mapped.loops is None else mapped.loops.figures(),
         imu=None if mapped.imu is None else mapped.imu.figures(),
+        base_frame=None if (mount := mapped.session.mount) is None else mount.base,
         sfm=None if mapped.sfm is None else mapped.sfm.figures(),
         trajectory=errors.path,
         map=errors.surface,

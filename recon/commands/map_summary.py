@@ -101,6 +101,9 @@ class MapSummary(RunSummary):
     rig: RigFigures
     loops: LoopFigures | None = optional()
     imu: ImuFigures | None = optional()
+    base_frame: str | None = (
+        optional()
+    )  # frame of the robot, whose static transforms say where it is
     sfm: SfmFigures | None = optional()
     trajectory: TrajectoryMetrics | None = optional()  # errors, where the truth is known
     map: MapMetrics | None = optional()
@@ -121,7 +124,7 @@ class MapSummary(RunSummary):
             (f"map of {counted(self.frames, 'frame')}{doubted}, {path}",),
             *self.folder_row(),
             *self.made.rows(self.voxel_m),
-            *self._accuracy(),
+            *(self._accuracy() or self._base()),
             *self.cost_row(*rate, *poses),
             ("next", self.open_view()),
         ]
@@ -135,6 +138,10 @@ class MapSummary(RunSummary):
             near = f"within {surface.threshold_m:g} m"
             parts.append(f"{100 * surface.precision:.0f} % of the points {near}")
         return [("accuracy", "; ".join(parts))] if parts else []
+
+    def _base(self) -> Rows:
+        said = f"{self.base_frame}, by the robot's static transforms"
+        return [] if self.base_frame is None else [("base", "trajectory_map_base_tum.txt", said)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,13 +5,18 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, TypeVar, cast
 
+import numpy as np
+
 from recon.core.errors import MappingError, MeshingError, OutputError, SettingsError
 from recon.core.progress import stage
+from recon.core.text import metres
 from recon.core.values import OccupancyGrid, PointCloud, TriangleMesh
+from recon.core.values.arrays import Float64
 from recon.core.work import Stopwatch
 from recon.export.cloud import (
     arrays_product,
@@ -27,11 +32,13 @@ from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
 from recon.export.mesh.texture import texture_product
 from recon.export.nerfstudio import nerfstudio_product
-from recon.export.occupancy import GridFigures, grid_product, octomap_product
+from recon.export.occupancy import Flattening, GridFigures, grid_product, octomap_product
 from recon.export.product import ExportContext, ExportResult, Product, ProductFigures
 from recon.export.rasters import RASTERS, raster_product, stem_of
 from recon.io.atomic import check_targets, writing_to
 from recon.io.models.mesh import MESH_SUFFIXES
+from recon.map.ground.axes import base_axes
+from recon.map.ground.surface import BIN_M
 from recon.map.sessions.placed import check_rays, has_occupancy
 
 # In the order in which they are made.
@@ -65,6 +72,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
 FORMER_PRODUCTS: Final = {"occupancy": "grid-geotiff"}  # before 1.0
 USUAL: Final = ("cloud", "octomap", "grid", "mesh")  # unless something else is asked for
 OF_A_PAIR: Final = ("cloud", "mesh")
+_DOUBTED: Final = 2.0  # standard deviations between two heights, of which one is wrong then
 F = TypeVar("F", bound=ProductFigures)
 
 
@@ -95,9 +103,9 @@ class Products:
         return cast("OccupancyGrid", self.made["grid"].value)
 
     @property
-    def camera_height_m(self) -> float | None:
-        """Height of the camera above the ground; None = unknown, or not steady."""
-        return self.figures_of(GridFigures).camera_height_m
+    def T_base_camera(self) -> Float64:
+        """Where the camera is on the vehicle, float64 (4, 4)."""
+        return self.figures_of(GridFigures).T_base_camera
 
     @property
     def mesh(self) -> TriangleMesh | None:
@@ -133,10 +141,40 @@ def make(
 
 
 def _written(context: ExportContext, name: str, path: Path) -> ExportResult:
-    if PRODUCTS[name].needs_occupancy and not has_occupancy(context.map):
-        check_rays(context.map.first, context.placed.tiles.config)
+    first, doubts = context.map.first, []
+    if PRODUCTS[name].needs_occupancy:
+        if not has_occupancy(context.map):
+            check_rays(first, context.placed.tiles.config)
+        doubts = _stand_on_mounts(context)
     path.parent.mkdir(parents=True, exist_ok=True)
-    return PRODUCTS[name].write(context, path)
+    made = PRODUCTS[name].write(context, path)
+    if isinstance(figures := made.figures, GridFigures):
+        T_base_camera = base_axes(first.T_map_world, figures.camera_height_m, first.mount)
+        made = replace(made, figures=replace(figures, T_base_camera=T_base_camera))
+    return replace(made, warnings=[*doubts, *made.warnings])
+
+
+def _stand_on_mounts(context: ExportContext) -> list[str]:
+    """Let products be made with the height of the camera that all robots state; return doubts.
+
+    A height that is set wins over it; so does the ground that was seen, where it contradicts it.
+    """
+    placed, mounts = context.placed, [one.mount for one in context.map.linked]
+    config, ground = placed.tiles.config, placed.tiles.config.ground
+    height_m, *others = {None if one is None else one.camera_height_m for one in mounts}
+    if height_m is None or others or ground.camera_height_m is not None:
+        return []
+    for _, surface in islice(Flattening(placed).grounds(), 1):
+        seen_m = surface.camera_height_m  # along the whole path
+        off_m = np.abs(surface.drop_at(placed.path_m[:, :2]) - seen_m)
+        sigma_m = 1.4826 * float(np.nanmedian(np.append(off_m, 0.0)))  # of a normal distribution
+        if abs(seen_m - height_m) > _DOUBTED * np.hypot(sigma_m, BIN_M):
+            said = f"the static transforms put the camera {metres(height_m)} above the ground"
+            seen = f"{metres(seen_m)} ± {metres(sigma_m)}"
+            return [f"{said}, and it is {seen}, which the grid follows"]
+    known = ground.model_copy(update={"camera_height_m": height_m})
+    placed.tiles.config = config.model_copy(update={"ground": known})
+    return []
 
 
 def check_target(name: str, path: Path, inputs: Iterable[Path]) -> None:

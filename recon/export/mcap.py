@@ -62,7 +62,8 @@ def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
             for frame, views in drive.frames(images.get(drive.session.number)):
                 drive.write(bag, frame, views)
                 frames += 1
-    layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/", drives[0].name)
+    layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/base_link", drives[0].base)
+    layout = layout.replace("DRIVE/", drives[0].name)
     write_text(folder / "foxglove.json", layout)
     return ExportResult(BagFigures(frames), warnings)
 
@@ -74,7 +75,9 @@ class _Drive:
         self.session, self.placed = session, context.map.placed[session.number]
         # Of its topics and frames, with a slash.
         self.name = f"drive{session.number}/" if len(context.map.linked) > 1 else ""
-        self._T_base_camera = base_axes(context.map.first.T_map_world, height_m)
+        self.base = f"{self.name}{'base_link' if session.mount is None else session.mount.base}"
+        T_map_world = context.map.first.T_map_world
+        self._T_base_camera = base_axes(T_map_world, height_m, session.mount)
         path = session.trajectory
         if not (path.timestamps_s[0] >= 0.0 and path.timestamps_s[-1] < 2.0**31):
             what, got = "times of the frames do not fit into a bag", f"{path.timestamps_s[0]:g} s"
@@ -87,8 +90,8 @@ class _Drive:
     def mounted(self) -> list[tuple[str, str, Float64]]:
         """Return where the cameras are on the vehicle."""
         beside = make_transform(np.eye(3), np.array([self.session.camera.baseline_m, 0.0, 0.0]))
-        base, left, right = (f"{self.name}{one}" for one in ("base_link", "left", "right"))
-        return [(base, left, self._T_base_camera), (left, right, beside)]
+        left, right = (f"{self.name}{one}" for one in ("left", "right"))
+        return [(self.base, left, self._T_base_camera), (left, right, beside)]
 
     def frames(self, images: DriveImages | None) -> Iterator[tuple[int, tuple[UInt8, ...]]]:
         """Yield the frames that have a place, with rectified images if they can be read."""
@@ -98,7 +101,7 @@ class _Drive:
             yield from images.views()
 
     def write(self, bag: RosBag, frame: int, views: tuple[UInt8, ...]) -> None:
-        time_ns, T, base = self.times_ns[frame], self._T_map_base[frame], f"{self.name}base_link"
+        time_ns, T, base = self.times_ns[frame], self._T_map_base[frame], self.base
         bag.write("/tf", time_ns, transforms(time_ns, [("map", base, T)]))
         spread = np.diag(np.repeat(self._variance[frame], 3)).ravel()
         content = {

@@ -17,7 +17,6 @@ from recon.core.values.arrays import Bool, Float64
 from recon.io.atomic import write_text
 from recon.io.fields import write_json
 from recon.io.trajectory import write_kitti_poses, write_tum
-from recon.map.ground.axes import base_axes
 from recon.map.localize.sequence import LocalizedDrive, LocalizedFrame
 from recon.map.store.map_file import MapFile
 from recon.map.store.session import Session
@@ -37,9 +36,7 @@ HEADER: Final = (
 _HEADING: Final = ",".join(HEADER) + "\n"
 
 
-def export_paths(
-    session: Session, joined: Bool, camera_height_m: float | None, folder: Path
-) -> None:
+def export_paths(session: Session, joined: Bool, T_base_camera: Float64, folder: Path) -> None:
     """Write ``trajectory_*.txt`` of a drive, and ``loops.json`` if loops were closed.
 
     They have the frames that are joined (N,). Each other part of the drive between two breaks has
@@ -52,7 +49,7 @@ def export_paths(
     path = session.trajectory.select(joined)
     write_kitti_poses(folder / "trajectory_kitti.txt", path)
     write_tum(folder / "trajectory_tum.txt", path)
-    based = _of_base(path, session.T_map_world, camera_height_m)
+    based = _of_base(path, session.T_map_world, T_base_camera)
     write_tum(folder / "trajectory_map_base_tum.txt", based)
     if session.loops.get("closed"):
         write_tum(folder / "trajectory_odometry_tum.txt", session.odometry.select(joined))
@@ -79,10 +76,10 @@ def export_sessions(map_: MapFile, folder: Path) -> None:
         write_tum(folder / f"sessions/{number}/trajectory_tum.txt", path)
 
 
-def export_localized(drive: LocalizedDrive, camera_height_m: float | None, folder: Path) -> None:
+def export_localized(drive: LocalizedDrive, T_base_camera: Float64, folder: Path) -> None:
     """Write ``trajectory_tum.txt`` and ``trajectory_map_base_tum.txt``."""
     write_tum(folder / "trajectory_tum.txt", drive.trajectory)
-    based = _of_base(drive.trajectory, drive.T_map_world, camera_height_m)
+    based = _of_base(drive.trajectory, drive.T_map_world, T_base_camera)
     write_tum(folder / "trajectory_map_base_tum.txt", based)
 
 
@@ -103,10 +100,10 @@ def begin_states(path: Path) -> Callable[[LocalizedFrame], None]:
     return add
 
 
-def _of_base(path: Trajectory, T_map_world: Float64, camera_height_m: float | None) -> Trajectory:
+def _of_base(path: Trajectory, T_map_world: Float64, T_base_camera: Float64) -> Trajectory:
     """Return the path of the base of the vehicle, in map axes, from that of its camera."""
-    T_camera_base = invert(base_axes(T_map_world, camera_height_m))
-    return replace(path, T_world_camera=T_map_world @ path.T_world_camera @ T_camera_base)
+    T = T_map_world @ path.T_world_camera @ invert(T_base_camera)
+    return replace(path, T_world_camera=T)
 
 
 def _line(frame: LocalizedFrame) -> str:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
 
-from recon.core.geometry.se3 import make_transform
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.map.ground.axes import base_axes
@@ -18,7 +17,6 @@ from recon.odometry.protocol import OdometryHealth, OdometryResult
 from recon.places.closure import USUAL
 from recon.places.places import path_lengths, spread_over
 from recon.sources.source import Mount, StereoSource
-from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,15 +80,6 @@ class _Nobody(DriveListener):
 NOBODY: Final = _Nobody()
 
 
-def mount_of(source: StereoSource, settings: RectificationSettings) -> Mount | None:
-    """Return where the rectified view of the left camera is on the robot; None = not known."""
-    mount = source.read_mount()
-    if mount is None:
-        return None
-    T_camera_view = make_transform(turns_of(source.calibration, settings).R_left.T, np.zeros(3))
-    return replace(mount, T_base_camera=mount.T_base_camera @ T_camera_view)
-
-
 @dataclass
 class PoseTeller:
     """Makes of poses by odometry what a listener is told, and counts how far they may be off."""
@@ -148,9 +137,7 @@ class PoseTeller:
 
     def base(self, T_map_world: Float64, camera_height_m: float | None) -> Float64:
         """Return ``T_base_camera`` (4, 4): as mounted, else by the height above the ground."""
-        if self.mount is not None:
-            return self.mount.T_base_camera
-        return base_axes(T_map_world, camera_height_m)
+        return base_axes(T_map_world, camera_height_m, self.mount)
 
     def _drifted(self, T_world_camera: Float64, health: OdometryHealth) -> Float64:
         trusted: Bool = np.array([True, health.ok])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections import defaultdict, deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +21,7 @@ from recon.core.values.image import join_pair
 from recon.io.cameras.ros import (
     NS,
 )
-from recon.io.files import refuse_special, resolved
+from recon.io.files import reading, refuse_special, resolved
 from recon.io.imu import imu_of
 from recon.io.positions import Positions, in_order, read_positions
 from recon.io.ros.contents import (
@@ -35,7 +35,7 @@ from recon.sources.calibration import read_rig
 from recon.sources.images import find_partners
 from recon.sources.rosbags import Bag
 from recon.sources.settings import SourceSettings
-from recon.sources.source import ReadPrior, Recording, pair_frames
+from recon.sources.source import BASES, Mount, ReadPrior, Recording, pair_frames
 from recon.sources.times import check_increasing, pair_stamps
 from recon.sources.topics import (
     IMAGES,
@@ -83,6 +83,10 @@ class BagSource(Recording):
         if name is None:
             return None
         return read_imu_topic(self.bag, name, self.topics[0], stamped=self.stamped)
+
+    def read_mount(self) -> Mount | None:
+        with reading(self.bag.paths[0]):
+            return find_mount(_static_edges(self.bag), self.bag.frame_id(self.topics[0]))
 
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         if start >= len(self):
@@ -194,6 +198,7 @@ def _list_others(bag: Bag, used: Sequence[str]) -> str:
 
 
 _STATIC: Final = "tf_static"
+_UNIT: Final = 1e-2  # off length 1, from which tf2 ignores a quaternion
 _ODOMETRY: Final = "odom"  # the frame in which wheels and inertial units measure, by REP 105
 
 
@@ -213,7 +218,8 @@ def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadP
             raise FormatError("pose is not finite, or has no rotation", where=where)
     path = Trajectory(np.stack([_transform(poses[index]) for index in first]), times_ns * NS)
     camera = bag.frame_id(image_topic)
-    T_child_camera = _static_transform(bag, child, camera)
+    with reading(bag.paths[0]):
+        T_child_camera = static_transform(_static_edges(bag), child, camera)
     origin = f"{name}, {counted(len(path), 'pose')} of {child or 'an unnamed frame'} in {parent}"
     if T_child_camera is None:
         return ReadPrior(path, f"{origin}, no static transform to {camera or 'the camera'}")
@@ -228,7 +234,9 @@ def read_imu_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> I
     columns = [int(stamped), *range(2, 8)]
     places = [f"{name}, message {n}" for n in range(len(table))]
     record = imu_of(table[:, columns], places, where)
-    T_imu_camera = _static_transform(bag, bag.frame_id(name), bag.frame_id(image_topic))
+    with reading(bag.paths[0]):
+        names = bag.frame_id(name), bag.frame_id(image_topic)
+        T_imu_camera = static_transform(_static_edges(bag), *names)
     if T_imu_camera is not None:
         return replace(record, T_camera_imu=invert(T_imu_camera))
     note = f"IMU: no static transform from {name} to the camera: its axes are what the drive shows"
@@ -255,22 +263,52 @@ def _transform(pose: BagPose) -> Float64:
     return make_transform(rotation_from_quaternion(pose.xyzw), pose.xyz_m)
 
 
-def _static_transform(bag: Bag, start: str, goal: str) -> Float64 | None:
-    """Return T_start_goal by the static transforms of a recording; None = they do not connect."""
-    topics = [t.name for t in bag.topics.values() if t.kind in TRANSFORMS and _STATIC in t.name]
+def static_transform(edges: Iterable[BagPose], start: str, goal: str) -> Float64 | None:
+    """Return T_start_goal, float64 (4, 4), by static transforms; None = they do not connect.
+
+    The way has as few steps as can be. Of what is said of two frames the last counts, and what is
+    no motion does not, as in tf; where nothing else leads to the goal, it is a `FormatError`.
+    """
     steps: dict[str, dict[str, Float64]] = defaultdict(dict)
-    for pose in (pose for topic in topics for pose in bag.poses(topic)):
-        T_parent_child = _transform(pose)
-        steps[pose.parent][pose.child] = T_parent_child
-        steps[pose.child][pose.parent] = invert(T_parent_child)
-    reached, waiting = {start: np.eye(4)}, [start]
+    broken = []
+    for edge in edges:
+        unit = abs(float(np.linalg.norm(edge.xyzw)) - 1.0) <= _UNIT
+        if not (unit and np.isfinite(edge.xyz_m).all()):
+            broken.append(f"{edge.parent} to {edge.child}, {edge.xyz_m}, {edge.xyzw}")
+            continue
+        steps[edge.parent][edge.child] = _transform(edge)
+        steps[edge.child][edge.parent] = invert(_transform(edge))
+    start, goal = start.lstrip("/"), goal.lstrip("/")
+    reached, waiting = {start: np.eye(4)}, deque([start])
     while waiting:
-        here = waiting.pop()
+        here = waiting.popleft()
         for there, T_here_there in steps[here].items():
             if there not in reached:
                 reached[there] = reached[here] @ T_here_there
                 waiting.append(there)
+    if goal not in reached and broken:
+        what, expected = "a static transform is no motion", "a quaternion of length 1"
+        raise FormatError(what, got=broken[0], expected=f"finite numbers, {expected}")
     return reached.get(goal) if start and goal else None
+
+
+def find_mount(edges: Iterable[BagPose], camera: str) -> Mount | None:
+    """Return where the frame of the left images is on a robot; None = nothing connects them.
+
+    Its base is ``base_footprint``, on the ground, or else ``base_link``, with any prefix that ends
+    in a slash. Errors are those of `static_transform`.
+    """
+    known, camera = list(edges), camera.lstrip("/")
+    names = sorted({name for edge in known for name in (edge.parent, edge.child)} - {camera})
+    for base in (name for last in BASES for name in names if name.rpartition("/")[2] == last):
+        if (T_base_camera := static_transform(known, base, camera)) is not None:
+            return Mount(T_base_camera, base, camera)
+    return None
+
+
+def _static_edges(bag: Bag) -> list[BagPose]:
+    topics = [t.name for t in bag.topics.values() if t.kind in TRANSFORMS and _STATIC in t.name]
+    return [pose for topic in topics for pose in bag.poses(topic)]
 
 
 def read_measured(path: Path) -> Positions:

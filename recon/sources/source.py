@@ -11,11 +11,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+import numpy as np
+
 from recon.core.errors import SourceError
 from recon.core.summary import Figures, optional
 from recon.core.text import counted, is_count
 from recon.core.values import ImuRecord, OccupancyTruth, Recorded, Rig, SequenceTruth, Trajectory
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Float64, freeze
 from recon.io.files import fingerprint
 from recon.io.trajectory import read_tum
 from recon.sources.settings import SourceSettings
@@ -29,13 +31,30 @@ class ReadPrior:
     origin: str
 
 
+BASES: Final = ("base_footprint", "base_link")
+"""How the name of a robot's base ends: on the ground (REP 120), or anywhere on it (REP 105)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Mount:
-    """Where the left camera is on a robot, by the robot's own static transforms (REP 105)."""
+    """Where the left camera is on a robot, by the robot's own static transforms (REP 105).
 
-    T_base_camera: Float64  # (4, 4), of the camera as mounted, not of its rectified view
+    ``T_base_camera`` is float64 (4, 4), of the camera as mounted or of its rectified view, as is
+    said; the base has x forward, y left, z up (REP 103).
+    """
+
+    T_base_camera: Float64
     base: str = "base_link"  # name of the frame of the robot
     camera: str = "left"  # name of the frame of the images
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_base_camera", np.float64, (4, 4))
+
+    @property
+    def camera_height_m(self) -> float | None:
+        """Height of the camera above the ground; None = the base may be anywhere above it."""
+        height_m = float(self.T_base_camera[2, 3])
+        return height_m if self.base.rpartition("/")[2] == BASES[0] and height_m > 0 else None
 
 
 @dataclass(frozen=True)
@@ -181,7 +200,7 @@ class StereoSource(ABC):
         return None
 
     def read_mount(self) -> Mount | None:
-        """Read where the camera is on the robot; None = nothing says so."""
+        """Read where the left camera, as mounted, is on the robot; None = nothing says so."""
         return None
 
     def asked_start(self) -> Float64 | None:

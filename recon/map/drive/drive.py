@@ -27,7 +27,7 @@ from recon.look.tracks import LiveTracks
 from recon.map.builders import thin_rays
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.mapper import FrameResult, Mapper
-from recon.map.listener import NOBODY, DriveBegun, DriveListener, PoseTeller, mount_of
+from recon.map.listener import NOBODY, DriveBegun, DriveListener, PoseTeller
 from recon.map.map import Map
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
@@ -63,7 +63,7 @@ class Drive:
         self._loops, self._map = loops, workspace.map
         self._views = NewViews(reconstructor.camera)
         self._stage = workspace.stopwatch.stage
-        self._listener, mount = workspace.listener, mount_of(source, config.rectification)
+        self._listener, mount = workspace.listener, mapper.session.mount
         self._teller = PoseTeller(mount, config.scale)
         begun = DriveBegun(source, reconstructor.camera, self._map.store.path, False, mount)
         self._listener.on_begin(begun)

@@ -22,9 +22,9 @@ from recon.odometry.prior import MotionPrior, find_axes, first_moving
 from recon.odometry.protocol import Odometry, OdometryFrame
 from recon.odometry.registry import KnownPoses, make_odometry
 from recon.odometry.settings import PriorSettings
-from recon.sources.source import StereoSource
+from recon.sources.source import Mount, StereoSource
 from recon.stereo.frame import FrameReconstructor
-from recon.stereo.rectify.rectifier import turns_of
+from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
 
 _KNOWN: Final = PriorSettings(sigma_ratio=0.01)
 """How well poses are expected to be known; only where they are much worse is it said."""
@@ -125,6 +125,20 @@ def imu_of(
     fitted = fit_imu(record, stamps_s, lambda: seen_runs(source, reconstructor), T_camera_imu)
     guide = fitted.guide
     return replace(fitted, guide=guide and replace(guide, scale=config.scale))
+
+
+def mount_of(
+    source: StereoSource, settings: RectificationSettings
+) -> tuple[Mount | None, list[str]]:
+    """Return where the rectified view of the left camera is on the robot, or why nobody knows."""
+    try:
+        mount = source.read_mount()
+    except ReconError as error:
+        return None, [f"transforms of the robot not used: {error}"]
+    if mount is None:
+        return None, []
+    T_camera_view = make_transform(turns_of(source.calibration, settings).R_left.T, np.zeros(3))
+    return replace(mount, T_base_camera=mount.T_base_camera @ T_camera_view), []
 
 
 def doubt_poses(

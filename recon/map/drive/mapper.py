@@ -149,10 +149,21 @@ class Mapper:
                 raise FormatError("submaps of the drive are missing")
 
     def fix_axes(self, cloud: PointCloud) -> SubmapBuilder:
-        """Lay the axes of the map by the ground in a cloud, world axes; begin the first submap."""
-        config, cloud = self._config, cloud.only_measured()
-        ground = estimate_ground(cloud, config.scale, self._up)
-        T_map_world = map_axes(ground, config.axes, config.ground.camera_height_m, self._up)
+        """Lay the axes of the map by the ground in a cloud, world axes; begin the first submap.
+
+        A robot heads them, and levels them where no inertial unit does. What it says of its camera
+        is forgotten where the only ground is one that it cannot stand on.
+        """
+        config, cloud, R_base_world = self._config, cloud.only_measured(), None
+        ground, height_m = estimate_ground(cloud, config.scale, self._up), None
+        if (mount := self.session.mount) is not None:
+            R_base_world, height_m = mount.T_base_camera[:3, :3], mount.camera_height_m
+            below = estimate_ground(cloud, config.scale, R_base_world[2])
+            if ground is not None and below is None:
+                self.session.mount = R_base_world = height_m = None
+            ground = below or ground
+        height_m = config.ground.camera_height_m or height_m
+        T_map_world = map_axes(ground, config.axes, height_m, self._up, R_base_world)
         self.session.set_axes(T_map_world, self._camera)
         seen_m = None if ground is None else ground.height_m
         self.axes = T_map_world, config.ground.camera_height_m or seen_m

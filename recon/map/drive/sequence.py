@@ -37,6 +37,7 @@ from recon.map.drive.drive_odometry import (
     arriving_guide,
     axes_of,
     imu_of,
+    mount_of,
     odometry_of,
 )
 from recon.map.drive.mapper import Mapper
@@ -79,6 +80,7 @@ class MappedSequence:
         seconds: Wall-clock time from the first frame to the last.
         loops, prior, imu, sfm: What came of loop closure, of an external trajectory, of an inertial
             unit, of structure from motion; None = they were not used.
+        doubts: Why what the robot says of where its camera is was not used.
         threads: Threads with which rays are cast.
         tracks: What a drive showed of its rig while it arrived; empty of any other.
     """
@@ -91,6 +93,7 @@ class MappedSequence:
     prior: UsedPrior | None = None
     imu: FittedImu | None = None
     sfm: FoundPoses | None = None
+    doubts: Sequence[str] = ()
     threads: int = 1
     tracks: Sequence[StereoTracks] = ()
 
@@ -245,6 +248,9 @@ def map_sequence(
         search=looking,
         scale=config.scale,
     )
+    mount, doubts = mount_of(source, config.rectification)
+    if not len(session):
+        session.mount = mount
     up = None if imu is None or imu.guide is None else imu.guide.up
     mapper = Mapper(config, reconstructor.camera, odometry, session, work.stopwatch, up)
     checked = odometry.odometry if isinstance(odometry, CheckedOdometry) else None
@@ -266,6 +272,9 @@ def map_sequence(
         drive.stop()
     stage("close loops")
     drive.finish()
+    if mount is not None and session.mount is None:
+        hint = f"it is not used; is {mount.camera} an optical frame (z forward)?"
+        doubts = [f"{mount.base} does not stand on the ground that is seen: {hint}"]
     return MappedSequence(
         map=work.map,
         config=config,
@@ -274,6 +283,7 @@ def map_sequence(
         loops=drive.close_loops(session.odometry),
         prior=used,
         imu=imu,
+        doubts=doubts,
         sfm=odometry.found if isinstance(odometry, FoundOdometry) else None,
         threads=work.threads or 1,
         tracks=() if tracks is None else tracks.windows,

@@ -13,6 +13,7 @@ from recon.core.geometry.se3 import exp_so3, make_transform, transform_cloud
 from recon.core.settings import Settings
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64, freeze
+from recon.sources.source import Mount
 
 AXES_MAP_WORLD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The turn from camera-like axes (right, down, forward) to map axes (forward, left, up)."""
@@ -63,19 +64,23 @@ def map_axes(
     settings: AxesSettings,
     camera_height_m: float | None = None,
     up: Float64 | None = None,
+    R_base_world: Float64 | None = None,
 ) -> Float64:
     """Return ``T_map_world``, float64 (4, 4), from world to map axes.
 
     Without a ground below the first camera (None), or with a tilt below the limit, exactly x_map =
     z_world, y_map = -x_world, z_map = -y_world; else also turned the short way so that the ground's
-    normal is z_map, or ``up`` (3,), world axes, where that is known. With its origin on the ground,
-    also moved up along z, by ``camera_height_m`` or else by the height above the plane.
+    normal is z_map, or ``up`` (3,), world axes, where that is known. Where the axes of the robot
+    are known, ``R_base_world`` (3, 3), the map has those, turned by ``up`` alone. With its origin
+    on the ground, also moved up along z, by ``camera_height_m`` or else by the height above the
+    plane.
     """
-    turn = AXES_MAP_WORLD
-    if up is None and ground is not None and ground.tilt_deg > _MIN_TILT_DEG:
+    turn = AXES_MAP_WORLD if R_base_world is None else R_base_world
+    free = up is None and R_base_world is None
+    if free and ground is not None and ground.tilt_deg > _MIN_TILT_DEG:
         up = ground.normal
     if up is not None:
-        turn = _short_turn(AXES_MAP_WORLD @ up, np.array([0.0, 0.0, 1.0])) @ AXES_MAP_WORLD
+        turn = _short_turn(turn @ up, np.array([0.0, 0.0, 1.0])) @ turn
     height_m = 0.0
     if settings.origin == "ground" and camera_height_m is not None:
         height_m = camera_height_m
@@ -98,12 +103,16 @@ def _short_turn(first: Float64, second: Float64) -> Float64:
     return exp_so3(axis / size * angle)
 
 
-def base_axes(T_map_world: Float64, camera_height_m: float | None) -> Float64:
+def base_axes(
+    T_map_world: Float64, camera_height_m: float | None, mount: Mount | None = None
+) -> Float64:
     """Return ``T_base_camera``, from the left camera to the base of the vehicle (`base_link`).
 
-    The base has the axes of the map in the first frame (x forward, y left, z up), and its origin on
-    the ground below the camera; in the camera where its height is not known (None).
+    Without a ``mount``, the base has the axes of the map in the first frame (x forward, y left, z
+    up), and its origin on the ground below the camera; in the camera where its height is not known.
     """
+    if mount is not None:
+        return mount.T_base_camera
     return make_transform(T_map_world[:3, :3], np.array([0.0, 0.0, camera_height_m or 0.0]))
 
 

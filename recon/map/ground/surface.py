@@ -24,7 +24,7 @@ from recon.core.values import OccupancyVoxels, PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int64, freeze
 from recon.core.values.grid import log_odds
 
-_BIN_M: Final = 0.05
+BIN_M: Final = 0.05  # to which a height of the camera is known at best
 _DEEPEST_M: Final = 5.0  # points farther below the path are not what the camera is carried on
 _NEIGHBOURS: Final = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
 CELL_M: Final = 1.0  # least edge of a cell of the surface
@@ -193,26 +193,26 @@ class _Field:
         """Return the commonest height of the path above the points near it; NaN without points."""
         near = self._ring.ravel()[self._cell] == 0
         drop = self._path_z.ravel()[self._cell[near]] - self._z[near]
-        drop = drop[(drop > 2 * _BIN_M) & (drop < _DEEPEST_M)]
+        drop = drop[(drop > 2 * BIN_M) & (drop < _DEEPEST_M)]
         if len(drop) < MIN_POINTS:
             return math.nan
-        votes = np.bincount((drop / _BIN_M).astype(int), minlength=3)
+        votes = np.bincount((drop / BIN_M).astype(int), minlength=3)
         smooth = np.convolve(votes, [1, 1, 1], mode="same")
-        mode = (int(np.argmax(smooth)) + 0.5) * _BIN_M
-        return float(np.median(drop[np.abs(drop - mode) < 3 * _BIN_M]))
+        mode = (int(np.argmax(smooth)) + 0.5) * BIN_M
+        return float(np.median(drop[np.abs(drop - mode) < 3 * BIN_M]))
 
     def drops(self) -> Float64:
         """Return the commonest height of the path above the points of each cell; NaN = none."""
         drop = self._path_z.ravel()[self._cell] - self._z
-        below = (drop > 2 * _BIN_M) & (drop < _DEEPEST_M)
+        below = (drop > 2 * BIN_M) & (drop < _DEEPEST_M)
         found = np.full(self.heights.size, np.nan)
         cells, slot = np.unique(self._cell[below], return_inverse=True)
-        bins = math.ceil(_DEEPEST_M / _BIN_M)
-        place = slot * bins + (drop[below] / _BIN_M).astype(int)
+        bins = math.ceil(_DEEPEST_M / BIN_M)
+        place = slot * bins + (drop[below] / BIN_M).astype(int)
         votes = np.bincount(place, minlength=len(cells) * bins).reshape(-1, bins)
         wide = np.pad(votes, ((0, 0), (1, 1)))
         smooth = wide[:, :-2] + votes + wide[:, 2:]
-        mode = (smooth.argmax(axis=1) + 0.5) * _BIN_M
+        mode = (smooth.argmax(axis=1) + 0.5) * BIN_M
         enough = smooth.max(axis=1, initial=0) >= MIN_POINTS
         found[cells[enough]] = mode[enough]
         return np.asarray(found.reshape(self.heights.shape))

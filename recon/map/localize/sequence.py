@@ -13,14 +13,15 @@ import numpy as np
 from recon.core.errors import MappingError, RegistrationError
 from recon.core.progress import LOGGER, series, stage
 from recon.core.settings import scaled
-from recon.core.summary import Figures, Rows, RunSummary, inline
+from recon.core.summary import Figures, Rows, RunSummary, inline, optional
 from recon.core.text import counted, metres
 from recon.core.values import OccupancyGrid, Recorded, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import look_ahead, serial_algebra
 from recon.look.rig import RigFigures
 from recon.map.drive.drive import Workspace
-from recon.map.listener import DriveBegun, PoseTeller, mount_of
+from recon.map.drive.drive_odometry import mount_of
+from recon.map.listener import DriveBegun, PoseTeller
 from recon.map.localize.localizer import Localizer, Located, State
 from recon.map.localize.surroundings import Surroundings
 from recon.map.settings import DriveSettings
@@ -233,7 +234,7 @@ def localize_sequence(
         return OdometryFrame(*reconstructor.match(pair))
 
     frames: list[LocalizedFrame] = []
-    mount, listener = mount_of(source, config.rectification), workspace.listener
+    mount, listener = mount_of(source, config.rectification)[0], workspace.listener
     teller, T_map_world = PoseTeller(mount, config.scale), map_.first.T_map_world
     listener.on_begin(DriveBegun(source, reconstructor.camera, map_.store.path, True, mount))
     base = T_map_world, workspace.camera_height_m or config.ground.camera_height_m
@@ -279,6 +280,9 @@ class LocalizeSummary(RunSummary):
     T_map_world: Float64  # (4, 4)
     drive: LocalizedFigures = inline()
     rig: RigFigures
+    base_frame: str | None = (
+        optional()
+    )  # frame of the robot, whose static transforms say where it is
     read: SourceFigures = inline()
 
     def rows(self) -> Rows:

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import FormatError, MappingError, SettingsError
-from recon.core.geometry.se3 import apply
+from recon.core.geometry.se3 import apply, invert
 from recon.core.values import RayCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import side_by_side
@@ -45,7 +45,8 @@ class PlacedMap:
     """What the drives of a map that share its axes observed, in tiles."""
 
     tiles: Tiles
-    # float64 (N, 3), positions of the camera, map axes; a row of NaN between two drives
+    # float64 (N, 3), positions of the camera, or as high above the base of its robot if that is
+    # known, map axes; a row of NaN between two drives
     path_m: Float64
     trusted: Bool  # (N,), which of them are to be trusted, and have a place in the map
 
@@ -244,7 +245,11 @@ def _with_path(map_: MapFile, settings: DriveSettings, tiles: Tiles) -> PlacedMa
         if paths:  # a row between two drives
             paths.append(np.full((1, 3), np.nan))
             good.append(np.zeros(1, np.bool_))
-        paths.append(apply(session.T_map_world, session.trajectory.positions_m))
+        path, mount = session.trajectory, session.mount
+        paths.append(apply(session.T_map_world, path.positions_m))
+        if mount is not None:
+            T = session.T_map_world @ path.T_world_camera @ invert(mount.T_base_camera)
+            paths[-1] = T[:, :3, 3] + mount.T_base_camera[2, 3] * T[:, :3, 2]
         good.append(placed[session.number])
     return PlacedMap(tiles, np.concatenate(paths), np.concatenate(good))
 

@@ -40,6 +40,7 @@ from recon.places.detector import StoredKeyframe
 from recon.places.keyframe import Keyframe
 from recon.places.places import Loop
 from recon.places.pose_graph import NO_FIXES, Fixes
+from recon.sources.source import Mount
 
 SESSION: Final = "session"
 AXES: Final = "axes"
@@ -70,7 +71,11 @@ class SessionInfo:
 
 
 class Session:
-    """One drive in a map; the next commit of the map keeps what is added."""
+    """One drive in a map; the next commit of the map keeps what is added.
+
+    ``mount`` is where the rectified left camera is on its robot, which is kept with the axes; None
+    = nothing says so.
+    """
 
     def __init__(self, store: Store, number: int) -> None:
         self._store = store
@@ -87,6 +92,10 @@ class Session:
                 for T, time_s, health in frames_in(store.read(FRAMES, (number, first))):
                     self.add_frame(T, time_s, health)
             self._flushed = len(self)
+            axes = store.get(AXES, number) if store.has(AXES, number) else {}
+            self.mount = value_in(Mount, axes["mount"]) if "mount" in axes else None
+            if self.mount is not None:
+                check_rigid("T_base_camera", self.mount.T_base_camera)
             if sorted(self._times_s) != self._times_s:
                 raise FormatError("frames of the drive are not in order")
             for name in (OPTIMISED_POSES, POSES_BEFORE_LINKS):
@@ -187,7 +196,8 @@ class Session:
 
     def set_axes(self, T_map_world: Float64, camera: RectifiedCamera) -> None:
         content = {"T_map_world": T_map_world, "camera": asdict(camera)}
-        self._store.put(AXES, self.number, content)
+        mounted = {} if self.mount is None else {"mount": asdict(self.mount)}
+        self._store.put(AXES, self.number, content | mounted)
 
     @property
     def rig(self) -> KnownRig | None:
