@@ -37,6 +37,7 @@ _LOOPBACK: Final = """<CycloneDDS><Domain><General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
 <MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
+_JOINING: Final = threading.Lock()  # a domain begins once
 _BASE: Final = {
     "byte": "uint8",
     "octet": "uint8",
@@ -122,7 +123,7 @@ class Network:
         self.domain = domain_of() if domain is None else domain
         own, self.reach = configuration_of()
         before = _sockets()
-        with self._our_errors("the network cannot be joined"):
+        with _JOINING, self._our_errors("the network cannot be joined"):
             self._domain = _domain(self.domain, configuration or own or "")
             self._participant = self._dds["domain"].DomainParticipant(self.domain)
             kinds = self._dds["builtin"].BuiltinTopicDcpsPublication
