@@ -256,6 +256,7 @@ def live(
     ] = None,
     out: opt.Out = None,
     start: StartInMap = None,
+    to: opt.To = None,
     mesh: opt.Mesh = False,
     view: View = False,
     *,
@@ -284,9 +285,8 @@ def live(
         stopped = stack.enter_context(until_interrupted())
         pose, _ = read_start(start)
         settings = shared.settings()
-        options = shared.options(
-            "live", out, view=view, mesh=mesh, source=source, kind=reading.kind
-        )
+        asked = {"source": source, "kind": reading.kind, "bag": opt.is_bag(to)}
+        options = shared.options("live", out, view=view, mesh=mesh, **asked)
         drive: StereoSource
         if right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]
@@ -309,6 +309,7 @@ def localize(
     ],
     out: opt.Out = None,
     start: StartInMap = None,
+    to: opt.To = None,
     view: View = False,
     *,
     reading: DriveOptions,
@@ -331,7 +332,8 @@ def localize(
 
         pose, _ = read_start(start)
         settings = shared.settings()
-        options = shared.options("localize", out, view=view, source=source, kind=reading.kind)
+        asked = {"source": source, "kind": reading.kind, "bag": opt.is_bag(to)}
+        options = shared.options("localize", out, view=view, **asked)
         drive, options = open_drive(options, settings, shared)
         run = run_localize(drive, map_, settings, options, start=pose)
     shared.show(run.summary)

@@ -73,12 +73,13 @@ def run_localize(
         before = look_first(source, config, options, run, map_.known_rig(source.calibration))
         rig, source = before.rig, before.drive
         height_m = None if folder is None else figure_of(folder, "camera_height_m")
-        workspace = Workspace(map_, run.watch, run.threads, options.listener, height_m)
         where = {"map_run": str(map_path), "T_map_world": map_.first.T_map_world.tolist()}
         write_json(run.state(SUMMARY), where)
         note = begin_states(run.state(STATES))
         options.begun(run.folder)
-        drive = localize_sequence(source, workspace, config, start=start, note=note)
+        with options.listening(run) as options:
+            workspace = Workspace(map_, run.watch, run.threads, options.listener, height_m)
+            drive = localize_sequence(source, workspace, config, start=start, note=note)
         has_grid = folder is not None and (folder / GRID).is_file()
         grid = read_grid(map_path / GRID) if has_grid else None
         seen = [

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Event, Lock, Thread
 from typing import Any, Final
 
@@ -47,16 +47,17 @@ class RobotTopics(DriveListener):
     ``/tf``, ``/tf_static`` and ``/diagnostics`` have these names; those of the other topics, and of
     frames but ``map``, begin with ``prefix``. A pose that is not to be trusted is not written: what
     is wrong with it is in ``/diagnostics``. Where writing fails, the drive goes on without.
+    ``stamp_ns`` makes stamps of the times of frames; None = they are seconds since 1970.
     """
 
     def __init__(
         self,
-        writer: MessageWriter,
+        writers: Sequence[MessageWriter],
         prefix: str = "",
         *,
         stamp_ns: Callable[[float], int] | None = None,
     ) -> None:
-        self._out = _Guarded(writer)
+        self._out = _Guarded(writers)
         name = prefix.strip("/")
         self._topic, self._frame = (f"/{name}/", f"{name}/") if name else ("/", "")
         self._stamp_ns = stamp_ns or stamp_of
@@ -110,8 +111,7 @@ class RobotTopics(DriveListener):
             self._map.end()
 
     def warnings(self) -> list[str]:
-        why = self._out.error
-        return [] if why is None else [f"topics were written only in part: {why}"]
+        return [f"topics were written only in part: {error}" for error in self._out.errors]
 
     def _follow(self, found: DrivePose) -> Float64 | None:
         """Return where the base is in the frame ``odom``, and note where that is in the map.
@@ -238,21 +238,27 @@ class _ThinPath:
 
 
 class _Guarded:
-    """Writes messages of several threads until that fails, which is said once."""
+    """Writes messages of several threads, each writer until it fails, which is said once."""
 
-    def __init__(self, writer: MessageWriter) -> None:
-        self._writer, self._lock = writer, Lock()
-        self.error: BaseException | None = None
+    def __init__(self, writers: Sequence[MessageWriter]) -> None:
+        self._writers, self._lock = [*writers], Lock()
+        self.errors = list[BaseException]()
 
     def write(self, topic: str, time_ns: int, message: Message, *, kept: bool = False) -> None:
         with self._lock:
-            if self.error is not None:
-                return
-            try:
-                self._writer.write(topic, time_ns, message, kept=kept)
-            except Exception as error:  # noqa: BLE001 - of any writer; the map is not lost for it
-                self.error = error
-                LOGGER.warning("warning: topics are not written any more: %s", error)
+            one = topic, time_ns, message
+            self._writers = [to for to in self._writers if self._written(to, *one, kept=kept)]
+
+    def _written(
+        self, writer: MessageWriter, topic: str, time_ns: int, message: Message, *, kept: bool
+    ) -> bool:
+        try:
+            writer.write(topic, time_ns, message, kept=kept)
+        except Exception as error:  # noqa: BLE001 - of any writer; a map is not lost for it
+            self.errors.append(error)
+            LOGGER.warning("warning: topics are not written any more: %s", error)
+            return False
+        return True
 
 
 class _MapTopics:

@@ -67,7 +67,7 @@ class DriveListener(Protocol):
         return
 
     def on_end(self) -> None:
-        """Hear that the frames are over, and that all of the map is in its file."""
+        """Hear that the frames are over; unless by an error, all of the map is in its file."""
         return
 
     def warnings(self) -> list[str]:
@@ -77,6 +77,9 @@ class DriveListener(Protocol):
 
 class _Nobody(DriveListener):
     """Wants to know nothing."""
+
+    def __repr__(self) -> str:
+        return "NOBODY"
 
 
 NOBODY: Final = _Nobody()

@@ -253,10 +253,10 @@ def map_sequence(
                 drive.tell(step)
                 shown.on_step(step)
             drive.wait()
+        drive.finish()
     finally:
         drive.stop()
     stage("close loops")
-    drive.finish()
     return MappedSequence(
         map=work.map,
         config=config,
