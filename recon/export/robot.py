@@ -18,8 +18,7 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import adjoint, as_step, invert, make_transform, step_covariance
 from recon.core.progress import LOGGER
 from recon.core.values.arrays import Float64
-from recon.core.work import work_in_background
-from recon.export.growing import GrowingMap
+from recon.export.growing import MapBeside
 from recon.io.ros.messages import (
     NS_PER_S,
     Message,
@@ -74,7 +73,7 @@ class RobotTopics(DriveListener):
         self._base = f"{self._frame}base_link" if mount is None else mount.base
         self._camera = f"{self._frame}left" if mount is None else f"{mount.camera}_rectified"
         if begun.map_path is not None:
-            grow = GrowingMap(begun.map_path, finished=begun.in_map)
+            grow = MapBeside(begun.map_path, finished=begun.in_map)
             self._map = _MapTopics(self._out, self._topic, grow, self._stamp_ns)
 
     def on_pose(self, found: DrivePose) -> None:
@@ -262,10 +261,10 @@ class _Guarded:
 
 
 class _MapTopics:
-    """Writes the map as it grows, in a thread of its own that works a fraction of the time."""
+    """Writes the map as it grows, which is made a fraction of the time."""
 
     def __init__(
-        self, out: _Guarded, topic: str, growing: GrowingMap, stamp_ns: Callable[[float], int]
+        self, out: _Guarded, topic: str, growing: MapBeside, stamp_ns: Callable[[float], int]
     ) -> None:
         self._out, self._topic, self._growing, self._stamp_ns = out, topic, growing, stamp_ns
         self.note = ""
@@ -280,9 +279,9 @@ class _MapTopics:
         self._over.set()
         self.grown.set()
         self._thread.join()
+        self._growing.close()
 
     def _work(self) -> None:
-        work_in_background()
         over = False
         while not over:
             self.grown.wait()
