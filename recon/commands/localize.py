@@ -168,7 +168,8 @@ def run_live(
             map_sequence(first, config, workspace=Workspace(map_))
         else:
             localize_sequence(first, Workspace(map_), config)
-    played = LiveSource(source, None if source.live else rate, stopped)
+    rate_now = None if source.live else rate
+    played = source if isinstance(source, LiveSource) else LiveSource(source, rate_now, stopped)
     options = replace(options, audit=False)
     if map_path is not None:
         return run_localize(played, map_path, config, options, start=start).summary
@@ -178,7 +179,7 @@ def run_live(
         if not played.warnings():
             raise
         why = "; ".join(played.warnings())
-        hint = "play it more slowly, such as --rate 0.5, or take a smaller image or faster matcher"
+        hint = f"{played.slower}, or take a smaller image or faster matcher"
         raise MappingError(error.what, where=error.where, got=why, hint=hint) from error
 
 
@@ -188,8 +189,8 @@ class _Beginning(DerivedSource):
     def __init__(self, source: StereoSource) -> None:
         super().__init__(source)
         self._pairs = list[Recorded]()
-        begun_s = None
-        for pair in islice(source.frames(), _FIRST if isinstance(source, CameraSource) else _MOST):
+        begun_s, once = None, source.live or isinstance(source, CameraSource)
+        for pair in islice(source.frames(), _FIRST if once else _MOST):
             self._pairs.append(replace(pair, timestamp_s=len(self._pairs) * _PACE_S))
             begun_s = pair.timestamp_s if begun_s is None else begun_s
             if len(self._pairs) >= _FIRST and pair.timestamp_s - begun_s >= _LOOK_S:

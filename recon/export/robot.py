@@ -93,8 +93,8 @@ class RobotTopics(DriveListener):
         if edges:
             self._out.write("/tf", time_ns, transforms(time_ns, edges))
         self._before = None if T_odom_base is None else (time_ns, T_odom_base)
-        if found.T_map_camera is not None and found.covariance is not None:
-            T_map_base = found.T_map_camera @ invert(found.T_base_camera)
+        T_map_base = found.T_map_base
+        if T_map_base is not None and found.covariance is not None:
             spread = _in_parent(_of_base(found.covariance, found.T_base_camera), T_map_base)
             self._place(time_ns, T_map_base, spread)
         if found.state is not self._said or time_ns - self._said_ns >= _EVERY_NS:
@@ -171,8 +171,8 @@ class RobotTopics(DriveListener):
     def _health(self, time_ns: int, found: DrivePose) -> Message:
         live = self._begun.source.figures().live
         known: dict[str, Any] = {"state": found.state.value, "inliers": found.health.inliers}
-        if found.covariance is not None:
-            known["sigma_m"] = round(float(np.sqrt(np.trace(found.covariance[:3, :3]))), 4)
+        if found.trusted:
+            known["sigma_m"] = round(found.sigma_m, 4)
         if live is not None:
             known |= {name: getattr(live, name) for name in _COUNTED}
             known |= {f"latency_{name}_ms": of for name, of in vars(live.latency_ms).items()}

@@ -234,6 +234,8 @@ def poses_first(
             about = (index, len(source), 0.0, valid_ratio, 0, T, found.health)
             yield FrameResult(*about, time_s=rectified.timestamp_s)
             behind.add((rectified, found))
+            if source.patient:
+                behind.wait()
             if tracks is not None:
                 tracks.add(index, frame, found)
         behind.wait()
