@@ -7,6 +7,7 @@ from recon.commands.evaluate_middlebury import run_middlebury as run_middlebury
 from recon.commands.export import export_map as export_map
 from recon.commands.export import run_export as run_export
 from recon.commands.export import run_occupancy as run_occupancy
+from recon.commands.live_map import LiveMap as LiveMap
 from recon.commands.localize import run_live as run_live
 from recon.commands.localize import run_localize as run_localize
 from recon.commands.map import run_map as run_map
@@ -57,6 +58,7 @@ from recon.io.trajectory import read_trajectory as read_trajectory
 from recon.io.trajectory import write_trajectory as write_trajectory
 from recon.map.drive.sequence import MappedSequence as MappedSequence
 from recon.map.drive.sequence import map_sequence as map_sequence
+from recon.map.listener import DrivePose as DrivePose
 from recon.map.map import Map as Map
 from recon.map.map import MapPlaces as MapPlaces
 from recon.map.sessions.measured import Survey as Survey

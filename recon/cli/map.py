@@ -256,8 +256,13 @@ def live(
             default="make a map",
         ),
     ] = None,
+    prior: Annotated[
+        str | None,
+        opt.option("Topic of the odometry of wheels, with ros2:.", metavar="TOPIC"),
+    ] = None,
     out: opt.Out = None,
     start: StartInMap = None,
+    to: opt.To = None,
     mesh: opt.Mesh = False,
     view: View = False,
     *,
@@ -273,32 +278,37 @@ def live(
     calibrated; what the drive shows of it is in rig.yaml, for the next one. With
     --map, it is as the last drive of the map with this calibration showed it.
 
+    From topics of ROS 2 (ros2:), an inertial unit and /tf_static are used, too,
+    and /tf, /odometry, /pose, /path, /map, /costmap, /cloud and /diagnostics are
+    published. ROS_DOMAIN_ID names the domain; only this machine is talked to,
+    unless ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET or CYCLONEDDS_URI ask for more.
+
     Examples:
       recon live 0 2 --calib stereo.yaml
       recon live rides/today --rate 2
       recon live rides/today --map outputs/map/latest
+      recon live ros2:/left/image_raw,/right/image_raw --map outputs/map/latest
     """
     with shared.one_line_errors(), ExitStack() as stack:
         from recon.cli.progress import announce
         from recon.commands.localize import run_live
-        from recon.export.robot import RobotTopics
         from recon.rig.capture import is_camera, open_camera_source
         from recon.sources.ros2 import ADDRESS, open_ros2
 
         stopped = stack.enter_context(until_interrupted())
         pose, _ = read_start(start)
         settings = shared.settings()
-        options = shared.options(
-            "live", out, view=view, mesh=mesh, source=source, kind=reading.kind
-        )
+        asked = {"source": source, "kind": reading.kind, "bag": opt.is_bag(to)}
+        options = shared.options("live", out, view=view, mesh=mesh, **asked)
         drive: StereoSource
+        if prior is not None and not source.startswith(ADDRESS):
+            raise typer.BadParameter(f"--prior is a topic of {ADDRESS}; recon map takes files")
         if source.startswith(ADDRESS):
             if right_camera is not None:
                 raise typer.BadParameter(f"both topics are one argument: {ADDRESS}/left,/right")
-            network = open_ros2(source, settings.source, stopped=stopped)
-            drive = over_network = stack.enter_context(network)
-            topics = RobotTopics(over_network.network, stamp_ns=over_network.stamp_ns)
-            options = replace(options, listener=topics)
+            topics = stack.enter_context(open_ros2(source, settings.source, prior, stopped))
+            options = replace(options, writers=[topics.network], stamp_ns=topics.stamp_ns)
+            drive = topics
             announce(drive, quiet=shared.quiet, verbose=shared.verbose)
         elif right_camera is not None or is_camera(source):
             devices = [source] if right_camera is None else [source, right_camera]
@@ -321,6 +331,7 @@ def localize(
     ],
     out: opt.Out = None,
     start: StartInMap = None,
+    to: opt.To = None,
     view: View = False,
     *,
     reading: DriveOptions,
@@ -343,7 +354,8 @@ def localize(
 
         pose, _ = read_start(start)
         settings = shared.settings()
-        options = shared.options("localize", out, view=view, source=source, kind=reading.kind)
+        asked = {"source": source, "kind": reading.kind, "bag": opt.is_bag(to)}
+        options = shared.options("localize", out, view=view, **asked)
         drive, options = open_drive(options, settings, shared)
         run = run_localize(drive, map_, settings, options, start=pose)
     shared.show(run.summary)

@@ -91,6 +91,12 @@ Formats = Annotated[
     list[str] | None,
     option("Format of the mesh besides PLY: obj, stl or glb. May be repeated.", "--format", "-f"),
 ]
+To = Annotated[
+    list[str] | None,
+    option(
+        "mcap: also a bag of ROS 2 with frames, poses and the map, as they come.", metavar="mcap"
+    ),
+]
 Mesh = Annotated[bool, option("Reconstruct the surface mesh.")]
 Antenna = Annotated[
     str | None,
@@ -121,6 +127,15 @@ SOURCES_HELP = (
 def names_in(texts: Sequence[str] | None) -> list[str]:
     """Return the names that an option was given, several with commas or once each."""
     return [name.strip() for text in texts or () for name in text.split(",")]
+
+
+def is_bag(to: Sequence[str] | None) -> bool:
+    """Return whether a bag is to be written while a drive goes on, which is all there is."""
+    names = set(names_in(to))
+    if names - {"mcap"}:
+        what, hint = "not written while a drive goes on", "recon export makes it of the run"
+        raise SettingsError(what, where="--to", got=",".join(names), expected="mcap", hint=hint)
+    return bool(names)
 
 
 def parse_numbers(text: str | None, option: str) -> tuple[float, ...] | None:

@@ -74,12 +74,13 @@ def run_localize(
         before = look_first(source, config, options, run, map_.known_rig(source.calibration))
         rig, source = before.rig, before.drive
         height_m = None if folder is None else figure_of(folder, "camera_height_m")
-        workspace = Workspace(map_, run.watch, run.threads, options.listener, height_m)
         where = {"map_run": str(map_path), "T_map_world": map_.first.T_map_world.tolist()}
         write_json(run.state(SUMMARY), where)
         note = begin_states(run.state(STATES))
         options.begun(run.folder)
-        drive = localize_sequence(source, workspace, config, start=start, note=note)
+        with options.listening(run) as options:
+            workspace = Workspace(map_, run.watch, run.threads, options.listener, height_m)
+            drive = localize_sequence(source, workspace, config, start=start, note=note)
         has_grid = folder is not None and (folder / GRID).is_file()
         grid = read_grid(map_path / GRID) if has_grid else None
         own, doubts = mount_of(source, config.rectification)
@@ -173,7 +174,8 @@ def run_live(
             map_sequence(first, config, workspace=Workspace(map_))
         else:
             localize_sequence(first, Workspace(map_), config)
-    played = LiveSource(source, None if source.live else rate, stopped)
+    rate_now = None if source.live else rate
+    played = source if isinstance(source, LiveSource) else LiveSource(source, rate_now, stopped)
     options = replace(options, audit=False)
     if map_path is not None:
         return run_localize(played, map_path, config, options, start=start).summary
@@ -183,7 +185,7 @@ def run_live(
         if not played.warnings():
             raise
         why = "; ".join(played.warnings())
-        hint = "play it more slowly, such as --rate 0.5, or take a smaller image or faster matcher"
+        hint = f"{played.slower}, or take a smaller image or faster matcher"
         raise MappingError(error.what, where=error.where, got=why, hint=hint) from error
 
 

@@ -128,7 +128,8 @@ def run_map(
             options = replace(options, known_poses=poses)
         if options.workers is not None or begun_in_pieces(run):
             map_pieces(source, config, options, run, map_)
-        mapped = map_drive(source, config, options, run, map_)
+        with options.listening(run) as options:
+            mapped = map_drive(source, config, options, run, map_)
         rig = _shown_live(mapped, source, config, run) if source.live else found
         with run.stage("cloud"):
             check_map(mapped, source.name, (*seen.look.first, *findings))

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -21,8 +22,11 @@ from recon.core.errors import FormatError, OutputError, ReconError, SettingsErro
 from recon.core.geometry.se3 import make_transform
 from recon.core.machine import versions
 from recon.core.values import Trajectory
-from recon.export.make import USUAL
+from recon.export.make import PRODUCTS, USUAL
+from recon.export.robot import RobotTopics
 from recon.io.files import StrPath, resolved
+from recon.io.ros.bag import write_bag
+from recon.io.ros.messages import MessageWriter
 from recon.io.trajectory import read_trajectory
 from recon.map.drive.drive import ANEW, resuming, session_info
 from recon.map.listener import NOBODY, DriveListener
@@ -56,13 +60,17 @@ class MapOptions:
         audit: Whether a quick audit of the recording comes first, unless the settings forbid it.
         warn: Given the findings of the audit, before the drive is mapped.
         begun: Given the folder of the run, once its map or what it has located can be read.
-        listener: Is told of the drive while it goes on.
         resume: Resume the unfinished run in ``out``.
         workers: Where pieces of the drive are mapped side by side; None = in one piece, here,
             unless a run that is resumed was begun in pieces.
         source, kind: What `open` opens; kind None = inferred from its files.
         poses_file: File of the known poses, which `open` reads.
         prior_from: File of the prior, or a topic of the source; likewise.
+        listener: Is told of the drive while it goes on, unless topics are written.
+        writers: Where topics of a robot are written while it goes on, see `RobotTopics`.
+        namespace: What the names of its topics and frames begin with.
+        stamp_ns: Makes their stamps of the times of frames; None = they are seconds since 1970.
+        bag: Whether they are written into a bag in the folder of the run, too.
     """
 
     command: str = "map"
@@ -75,13 +83,17 @@ class MapOptions:
     audit: bool = True
     warn: Callable[[tuple[str, ...]], None] = lambda findings: None
     begun: Callable[[Path], None] = lambda folder: None
-    listener: DriveListener = NOBODY
     resume: bool = False
     workers: BatchOptions | None = None
     source: StrPath | None = None
     kind: str | None = None
     poses_file: StrPath | None = None
     prior_from: str | None = None
+    listener: DriveListener = NOBODY
+    writers: Sequence[MessageWriter] = ()
+    namespace: str = ""
+    stamp_ns: Callable[[float], int] | None = None
+    bag: bool = False
 
     @property
     def products(self) -> tuple[str, ...]:
@@ -161,6 +173,17 @@ class MapOptions:
     def run(self, config: ReconConfig) -> Run:
         """Return the run, which begins when it is entered."""
         return Run(self.command, self.out, config, threads=self.threads, resume=self.resume)
+
+    @contextmanager
+    def listening(self, run: Run) -> Iterator[Self]:
+        """Return the options with the listener that writes topics, if they are written."""
+        with ExitStack() as stack:
+            writers = [*self.writers]
+            if self.bag:
+                folder = run.path(PRODUCTS["mcap"].name)
+                writers.append(stack.enter_context(write_bag(folder, as_it_goes=True)))
+            topics = RobotTopics(writers, self.namespace, stamp_ns=self.stamp_ns)
+            yield replace(self, listener=topics) if writers else self
 
     def begin(self, run: Run, source: StereoSource, config: ReconConfig) -> Map:
         """Begin the map of a run; of one that is resumed, open it if nothing has changed."""

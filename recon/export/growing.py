@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import pickle
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, cast
 
 import numpy as np
 
-from recon.core.errors import MappingError
+from recon.core.errors import MappingError, ReconError
 from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.values import UNKNOWN, OccupancyGrid, PointCloud, join_clouds
+from recon.core.work import serial_algebra, work_in_background
 from recon.export.cloud import even_sample
 from recon.export.costmap import make_costmap
 from recon.export.occupancy import Flattening
@@ -66,6 +71,55 @@ class GrowingMap:
                 cloud = join_clouds(submap_cloud(session, session.submaps[n]) for n in new)
             time_s = float(session.trajectory.timestamps_s[-1])
             return MapSoFar(time_s, self._grid, self._costs, cloud, note)
+
+
+class MapBeside:
+    """Does what `GrowingMap` does in a process of the lowest priority, which ends with this one.
+
+    In a thread it would delay others: who is seldom given a core, and holds Python's lock.
+    """
+
+    def __init__(self, path: Path, *, finished: bool = False) -> None:
+        self.finished = finished
+        code = f"from {__name__} import _serve; _serve()"
+        words, pipe = [sys.executable, "-c", code, str(path), str(int(finished))], subprocess.PIPE
+        self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe)
+
+    def update(self) -> MapSoFar | None:
+        """Wait for the map with what is new in it; None = there is nothing."""
+        asked, answers = (cast("IO[bytes]", p) for p in (self._process.stdin, self._process.stdout))
+        try:
+            asked.write(b"\n")
+            asked.flush()
+            found = pickle.load(answers)  # noqa: S301 - of our own process
+        except (EOFError, OSError) as error:
+            raise MappingError("the process that makes the map has ended") from error
+        if isinstance(found, ReconError):
+            raise found
+        return cast("MapSoFar | None", found)
+
+    def close(self) -> None:
+        """End the process, which may work on a map that nobody waits for."""
+        self._process.kill()
+        self._process.communicate()
+
+
+def _serve() -> None:
+    """Answer each line that is read with what is new of a map."""
+    work_in_background()
+    path, finished = sys.argv[1:]
+    growing = GrowingMap(Path(path), finished=finished == "1")
+    answers = sys.stdout.buffer
+    sys.stdout = sys.stderr
+    for _ in sys.stdin:
+        found: MapSoFar | ReconError | None
+        try:
+            with serial_algebra():
+                found = growing.update()
+        except ReconError as error:
+            found = error
+        pickle.dump(found, answers, pickle.HIGHEST_PROTOCOL)
+        answers.flush()
 
 
 def _around(session: Session, new: range, reach_m: float) -> tuple[list[int], Rectangle]:

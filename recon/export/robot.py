@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Event, Lock, Thread
 from typing import Any, Final
 
@@ -18,8 +18,7 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import adjoint, as_step, invert, make_transform, step_covariance
 from recon.core.progress import LOGGER
 from recon.core.values.arrays import Float64
-from recon.core.work import work_in_background
-from recon.export.growing import GrowingMap
+from recon.export.growing import MapBeside
 from recon.io.ros.messages import (
     NS_PER_S,
     Message,
@@ -47,16 +46,17 @@ class RobotTopics(DriveListener):
     ``/tf``, ``/tf_static`` and ``/diagnostics`` have these names; those of the other topics, and of
     frames but ``map``, begin with ``prefix``. A pose that is not to be trusted is not written: what
     is wrong with it is in ``/diagnostics``. Where writing fails, the drive goes on without.
+    ``stamp_ns`` makes stamps of the times of frames; None = they are seconds since 1970.
     """
 
     def __init__(
         self,
-        writer: MessageWriter,
+        writers: Sequence[MessageWriter],
         prefix: str = "",
         *,
         stamp_ns: Callable[[float], int] | None = None,
     ) -> None:
-        self._out = _Guarded(writer)
+        self._out = _Guarded(writers)
         name = prefix.strip("/")
         self._topic, self._frame = (f"/{name}/", f"{name}/") if name else ("/", "")
         self._stamp_ns = stamp_ns or stamp_of
@@ -73,7 +73,7 @@ class RobotTopics(DriveListener):
         self._base = f"{self._frame}base_link" if mount is None else mount.base
         self._camera = f"{self._frame}left" if mount is None else f"{mount.camera}_rectified"
         if begun.map_path is not None:
-            grow = GrowingMap(begun.map_path, finished=begun.in_map)
+            grow = MapBeside(begun.map_path, finished=begun.in_map)
             self._map = _MapTopics(self._out, self._topic, grow, self._stamp_ns)
 
     def on_pose(self, found: DrivePose) -> None:
@@ -93,8 +93,8 @@ class RobotTopics(DriveListener):
         if edges:
             self._out.write("/tf", time_ns, transforms(time_ns, edges))
         self._before = None if T_odom_base is None else (time_ns, T_odom_base)
-        if found.T_map_camera is not None and found.covariance is not None:
-            T_map_base = found.T_map_camera @ invert(found.T_base_camera)
+        T_map_base = found.T_map_base
+        if T_map_base is not None and found.covariance is not None:
             spread = _in_parent(_of_base(found.covariance, found.T_base_camera), T_map_base)
             self._place(time_ns, T_map_base, spread)
         if found.state is not self._said or time_ns - self._said_ns >= _EVERY_NS:
@@ -110,8 +110,7 @@ class RobotTopics(DriveListener):
             self._map.end()
 
     def warnings(self) -> list[str]:
-        why = self._out.error
-        return [] if why is None else [f"topics were written only in part: {why}"]
+        return [f"topics were written only in part: {error}" for error in self._out.errors]
 
     def _follow(self, found: DrivePose) -> Float64 | None:
         """Return where the base is in the frame ``odom``, and note where that is in the map.
@@ -173,8 +172,8 @@ class RobotTopics(DriveListener):
     def _health(self, time_ns: int, found: DrivePose) -> Message:
         live = self._begun.source.figures().live
         known: dict[str, Any] = {"state": found.state.value, "inliers": found.health.inliers}
-        if found.covariance is not None:
-            known["sigma_m"] = round(float(np.sqrt(np.trace(found.covariance[:3, :3]))), 4)
+        if found.trusted:
+            known["sigma_m"] = round(found.sigma_m, 4)
         if live is not None:
             known |= {name: getattr(live, name) for name in _COUNTED}
             known |= {f"latency_{name}_ms": of for name, of in vars(live.latency_ms).items()}
@@ -239,28 +238,34 @@ class _ThinPath:
 
 
 class _Guarded:
-    """Writes messages of several threads until that fails, which is said once."""
+    """Writes messages of several threads, each writer until it fails, which is said once."""
 
-    def __init__(self, writer: MessageWriter) -> None:
-        self._writer, self._lock = writer, Lock()
-        self.error: BaseException | None = None
+    def __init__(self, writers: Sequence[MessageWriter]) -> None:
+        self._writers, self._lock = [*writers], Lock()
+        self.errors = list[BaseException]()
 
     def write(self, topic: str, time_ns: int, message: Message, *, kept: bool = False) -> None:
         with self._lock:
-            if self.error is not None:
-                return
-            try:
-                self._writer.write(topic, time_ns, message, kept=kept)
-            except Exception as error:  # noqa: BLE001 - of any writer; the map is not lost for it
-                self.error = error
-                LOGGER.warning("warning: topics are not written any more: %s", error)
+            one = topic, time_ns, message
+            self._writers = [to for to in self._writers if self._written(to, *one, kept=kept)]
+
+    def _written(
+        self, writer: MessageWriter, topic: str, time_ns: int, message: Message, *, kept: bool
+    ) -> bool:
+        try:
+            writer.write(topic, time_ns, message, kept=kept)
+        except Exception as error:  # noqa: BLE001 - of any writer; a map is not lost for it
+            self.errors.append(error)
+            LOGGER.warning("warning: topics are not written any more: %s", error)
+            return False
+        return True
 
 
 class _MapTopics:
-    """Writes the map as it grows, in a thread of its own that works a fraction of the time."""
+    """Writes the map as it grows, which is made a fraction of the time."""
 
     def __init__(
-        self, out: _Guarded, topic: str, growing: GrowingMap, stamp_ns: Callable[[float], int]
+        self, out: _Guarded, topic: str, growing: MapBeside, stamp_ns: Callable[[float], int]
     ) -> None:
         self._out, self._topic, self._growing, self._stamp_ns = out, topic, growing, stamp_ns
         self.note = ""
@@ -275,9 +280,9 @@ class _MapTopics:
         self._over.set()
         self.grown.set()
         self._thread.join()
+        self._growing.close()
 
     def _work(self) -> None:
-        work_in_background()
         over = False
         while not over:
             self.grown.wait()

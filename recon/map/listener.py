@@ -8,6 +8,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from recon.core.geometry.se3 import invert
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
 from recon.map.ground.axes import base_axes
@@ -49,6 +50,29 @@ class DrivePose:
     covariance: Float64 | None = None  # of it
     note: str = ""  # why it is not known, or not confirmed
 
+    @property
+    def trusted(self) -> bool:
+        """Whether it is known where in the map the camera is."""
+        return self.T_map_camera is not None
+
+    @property
+    def T_map_base(self) -> Float64 | None:
+        """float64 (4, 4), of the base of the robot: its origin, on the ground if that was seen."""
+        T = self.T_map_camera
+        return None if T is None else np.asarray(T @ invert(self.T_base_camera))
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the position, of its three axes together; NaN where unknown."""
+        return Located(self.state, covariance=self.covariance).sigma_m
+
+    def __repr__(self) -> str:
+        parts = [f"{self.time_s:.2f} s", self.state.value, *([self.note] if self.note else [])]
+        if self.T_map_camera is not None:
+            at = " ".join(f"{metres:.5g}" for metres in self.T_map_camera[:3, 3])
+            parts.append(f"at {at} m, sigma {self.sigma_m:.2g} m")
+        return f"DrivePose({', '.join(parts)})"
+
 
 class DriveListener(Protocol):
     """Is told of a drive while it goes on; what is not overridden does nothing."""
@@ -65,7 +89,7 @@ class DriveListener(Protocol):
         return
 
     def on_end(self) -> None:
-        """Hear that the frames are over, and that all of the map is in its file."""
+        """Hear that the frames are over; unless by an error, all of the map is in its file."""
         return
 
     def warnings(self) -> list[str]:
@@ -75,6 +99,9 @@ class DriveListener(Protocol):
 
 class _Nobody(DriveListener):
     """Wants to know nothing."""
+
+    def __repr__(self) -> str:
+        return "NOBODY"
 
 
 NOBODY: Final = _Nobody()

@@ -14,7 +14,7 @@ import numpy as np
 
 from recon.core.errors import SourceError
 from recon.core.text import counted, is_count
-from recon.core.values import ImuRecord, Recorded, Trajectory
+from recon.core.values import ImuRecord, Recorded, Rig, Trajectory
 from recon.core.values.arrays import Float64, UInt8
 from recon.io.images.image import silent_opencv
 from recon.sources.source import (
@@ -39,6 +39,8 @@ class LiveSource(DerivedSource):
     """
 
     live = True
+    slower = "play it more slowly, such as --rate 0.5"
+    """What to do where pairs arrive too fast."""
 
     def __init__(
         self,
@@ -153,8 +155,65 @@ class LiveSource(DerivedSource):
                     raise self._error
                 return None
             pair, due_s = self._waiting.popleft()
+            self._news.notify()
         self._due_s.append(due_s)
         return pair
+
+
+class _Rig(StereoSource):
+    """Cameras of which a program has the images."""
+
+    name, description = "pushed pairs", "pairs that a program has"
+    calibration: Rig
+
+    def __init__(self, calibration: Rig) -> None:
+        self.calibration = calibration
+
+    def __len__(self) -> int:
+        return 0
+
+    def frames(self, start: int = 0) -> Iterator[Recorded]:
+        return iter(())
+
+
+class PushedSource(LiveSource):
+    """Pairs that a program pushes when it has them, until `end`.
+
+    Where it is ``patient`` a push waits until the pair before is mapped, and none is left out. The
+    first pairs that are read are then given again, since they are looked at before the drive.
+    """
+
+    slower = "push fewer pairs each second, or wait for each: LiveMap(…, wait=True)"
+
+    def __init__(self, calibration: Rig, *, patient: bool = False) -> None:
+        super().__init__(_Rig(calibration), rate=None)
+        self.patient = patient
+        self._again: list[Recorded] | None = None
+
+    def frames(self, start: int = 0) -> Iterator[Recorded]:
+        looking, again = self._again is None, self._again or []
+        self._again = []
+        self._due_s, self.dropped = [time.monotonic()] * len(again), 0
+        yield from again
+        while (pair := self._take()) is not None:
+            if looking and self.patient:
+                self._again.append(pair)
+            yield pair
+
+    def push(self, pair: Recorded) -> None:
+        with self._news:
+            while self.patient and self._waiting and not self._ended:
+                self._news.wait()
+        self._put(pair, time.monotonic())
+
+    def end(self, error: BaseException | None = None) -> None:
+        """End the drive, perhaps by an error that is raised where pairs are taken."""
+        with self._news:
+            self._error = error
+            if error is not None:
+                self._waiting.clear()
+            self._ended = True
+            self._news.notify_all()
 
 
 _LONGEST_NUMBER: Final = 10

@@ -94,6 +94,8 @@ class StereoSource(ABC):
 
     live: bool = False
     """Whether pairs arrive in their own time: poses come first, and what is late is left out."""
+    patient: bool = False
+    """Of a live source: whether the next pair waits until the one before is mapped."""
     lead: int = 0
     """Pairs at the start that only lead the odometry, and are not put into the map."""
     truth_of_raw: bool = False

@@ -153,9 +153,10 @@ class Drive:
         self._last = time.perf_counter()
 
     def stop(self) -> None:
-        """Stop background work, finished or not."""
+        """Stop background work, finished or not, and tell the listener."""
         self.mapper.abandon()
         self._loops.stop()
+        self._listener.on_end()
 
     def finish(self) -> None:
         if not len(self.mapper):
@@ -163,7 +164,6 @@ class Drive:
         if len(self.mapper) > self._saved:
             self._save()
         self.mapper.close()
-        self._listener.on_end()
 
     def close_loops(self, path: Trajectory) -> DriveLoops | None:
         """Return the loops of the path, which the map keeps; None = they are not looked for."""
@@ -234,6 +234,8 @@ def poses_first(
             about = (index, len(source), 0.0, valid_ratio, 0, T, found.health)
             yield FrameResult(*about, time_s=rectified.timestamp_s)
             behind.add((rectified, found))
+            if source.patient:
+                behind.wait()
             if tracks is not None:
                 tracks.add(index, frame, found)
         behind.wait()

@@ -268,10 +268,10 @@ def map_sequence(
                 drive.tell(step)
                 shown.on_step(step)
             drive.wait()
+        drive.finish()
     finally:
         drive.stop()
     stage("close loops")
-    drive.finish()
     if mount is not None and session.mount is None:
         hint = f"it is not used; is {mount.camera} an optical frame (z forward)?"
         doubts = [f"{mount.base} does not stand on the ground that is seen: {hint}"]

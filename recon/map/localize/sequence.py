@@ -240,26 +240,30 @@ def localize_sequence(
     base = T_map_world, workspace.camera_height_m or config.ground.camera_height_m
     begun = time.perf_counter()
     stage("localize")
-    with serial_algebra(), series(source.name, len(source)) as shown:
-        # What is matched ahead of its turn would be old when it is located.
-        pairs = source.frames()
-        matched = map(match, pairs) if source.live else look_ahead(match, pairs)
-        for index, frame in enumerate(matched):
-            if (T_map_base := source.asked_start()) is not None:
-                _restart(localizer, T_map_world, T_map_base @ teller.base(*base))
-            with watch.stage("localize"):
-                start_s = time.perf_counter()
-                located = localizer.add(frame, hurried=source.hurried)
-                seconds = time.perf_counter() - start_s
-            frames.append(LocalizedFrame(index, frame.pair.timestamp_s, seconds, located))
-            note(frames[-1])
-            source.note_located(index)
-            listener.on_pose(teller.found(frames[-1].time_s, localizer.odometry, located, *base))
-            shown.on_step(frames[-1])
-            config.memory.check(f"frame {index}")
+    try:
+        with serial_algebra(), series(source.name, len(source)) as shown:
+            # What is matched ahead of its turn would be old when it is located.
+            pairs = source.frames()
+            matched = map(match, pairs) if source.live else look_ahead(match, pairs)
+            for index, frame in enumerate(matched):
+                if (T_map_base := source.asked_start()) is not None:
+                    _restart(localizer, T_map_world, T_map_base @ teller.base(*base))
+                with watch.stage("localize"):
+                    start_s = time.perf_counter()
+                    located = localizer.add(frame, hurried=source.hurried)
+                    seconds = time.perf_counter() - start_s
+                frames.append(LocalizedFrame(index, frame.pair.timestamp_s, seconds, located))
+                note(frames[-1])
+                source.note_located(index)
+                listener.on_pose(
+                    teller.found(frames[-1].time_s, localizer.odometry, located, *base)
+                )
+                shown.on_step(frames[-1])
+                config.memory.check(f"frame {index}")
+    finally:
+        listener.on_end()
     if not frames:
         raise RegistrationError("the source has no frame", where=source.name)
-    listener.on_end()
     return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
 
 
