@@ -83,7 +83,12 @@ class MapBeside:
         self.finished = finished
         code = f"from {__name__} import _serve; _serve()"
         words, pipe = [sys.executable, "-c", code, str(path), str(int(finished))], subprocess.PIPE
-        self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe)
+        self._process = subprocess.Popen(
+            words,
+            stdin=pipe,
+            stdout=pipe,
+            start_new_session=True,  # Ctrl-C ends the drive first
+        )
 
     def update(self) -> MapSoFar | None:
         """Wait for the map with what is new in it; None = there is nothing."""
