@@ -274,6 +274,15 @@ def live(found: Found) -> Rows:
     }
 
 
+def ros2(found: Found) -> Rows:
+    one = found["drive"]
+    rows: Rows = {"image of 466 kB to an array": one["image_ms"]}
+    for name, played in (("recording", one["files"]), ("topics", one["ros2"])):
+        dropped = {"dropped": played["frames_dropped"]}
+        rows[f"{name}: image to pose"] = {**played["latency_ms"], **dropped}
+    return {**rows, "topics: stamp to a listener": one["ros2"]["to_listener_ms"]}
+
+
 def memory(found: Found) -> Rows:
     one = found["street"]
     rows = {

@@ -126,6 +126,12 @@ TABLES: Final[dict[str, Table]] = {
         rows_of.live,
         timed=True,
     ),
+    "ros2": Table(
+        {"drive": f"python benchmarks/ros2.py {D13} --json"},
+        {"p50": "{:.1f} ms", "p95": "{:.1f} ms", "max": "{:.1f} ms", "dropped": "{}"},
+        rows_of.ros2,
+        timed=True,
+    ),
     "middlebury": Table(
         {
             "": scored(MIDDLEBURY, "plain", "sad,sgm,fine,opencv-bm,opencv-sgbm"),

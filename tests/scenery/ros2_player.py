@@ -65,6 +65,14 @@ def mount() -> list[tuple[str, str, Float64]]:
     return [("base_footprint", "base_link", np.eye(4)), ("base_link", "left", T)]
 
 
+def stand(network: Network, source: StereoSource, options: argparse.Namespace) -> None:
+    """Publish the first pair again and again until somebody publishes a topic: a robot waits."""
+    pair = next(iter(source.frames(options.start)))
+    while options.stand is not None and options.stand not in network.topics():
+        publish(network, source, pair, time.time_ns(), compressed=options.compressed)
+        time.sleep(0.1)
+
+
 def play(network: Network, source: StereoSource, options: argparse.Namespace) -> None:
     """Publish the pairs at their own pace, with stamps of now."""
     first, begun_s, ahead_s = None, time.time(), 0.0
@@ -118,14 +126,13 @@ def main() -> None:
     parser.add_argument("--end", type=int, default=None)
     parser.add_argument("--compressed", action="store_true")
     parser.add_argument("--imu", action="store_true")
+    parser.add_argument("--stand", metavar="TOPIC", help="wait until it is published")
     parser.add_argument("--domain", type=int, default=None)
     options = parser.parse_args()
     source = open_source(options.drive)
     network = Network(options.domain)
     network.write("/tf_static", 0, transforms(time.time_ns(), mount()), kept=True)
-    # Who listens must have found the topics before the drive begins.
-    for side, info in zip(("left", "right"), info_messages(source, 0), strict=True):
-        network.write(f"/{side}/camera_info", 0, info)
+    stand(network, source, options)
     sys.stderr.write(f"playing {source.name}\n")
     play(network, source, options)
     time.sleep(0.5)
