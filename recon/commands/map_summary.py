@@ -101,9 +101,7 @@ class MapSummary(RunSummary):
     rig: RigFigures
     loops: LoopFigures | None = optional()
     imu: ImuFigures | None = optional()
-    base_frame: str | None = (
-        optional()
-    )  # frame of the robot, whose static transforms say where it is
+    base_frame: str | None = optional()  # of the robot, as its static transforms have it
     sfm: SfmFigures | None = optional()
     trajectory: TrajectoryMetrics | None = optional()  # errors, where the truth is known
     map: MapMetrics | None = optional()

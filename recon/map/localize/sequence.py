@@ -284,9 +284,7 @@ class LocalizeSummary(RunSummary):
     T_map_world: Float64  # (4, 4)
     drive: LocalizedFigures = inline()
     rig: RigFigures
-    base_frame: str | None = (
-        optional()
-    )  # frame of the robot, whose static transforms say where it is
+    base_frame: str | None = optional()  # of the robot, as its static transforms have it
     read: SourceFigures = inline()
 
     def rows(self) -> Rows:
