@@ -34,7 +34,7 @@ def info_messages(source: StereoSource, time_ns: int) -> list[Message]:
     else:
         size, T = (rig.left.width_px, rig.left.height_px), rig.T_right_left
         known = [one for side in (rig.left, rig.right) for one in (side.matrix, side.distortion)]
-        turns_and_views = cv2.stereoRectify(*known, size, T[:3, :3], T[:3, 3])[:4]
+        turns_and_views = cv2.stereoRectify(*known, size, T[:3, :3].copy(), T[:3, 3:].copy())[:4]
         views = zip(turns_and_views[:2], turns_and_views[2:], strict=True)
         cameras = zip((rig.left, rig.right), views, strict=True)
         made = [(c.matrix, np.resize([*c.distortion, 0.0], 5), R, P) for c, (R, P) in cameras]
@@ -131,7 +131,10 @@ def main() -> None:
     options = parser.parse_args()
     source = open_source(options.drive)
     network = Network(options.domain)
-    network.write("/tf_static", 0, transforms(time.time_ns(), mount()), kept=True)
+    edges, imu = mount(), source.read_imu() if options.imu else None
+    if imu is not None and imu.T_camera_imu is not None:
+        edges.append(("left", "imu", imu.T_camera_imu))
+    network.write("/tf_static", 0, transforms(time.time_ns(), edges), kept=True)
     stand(network, source, options)
     sys.stderr.write(f"playing {source.name}\n")
     play(network, source, options)
