@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextvars
 import math
+from copy import copy
 from dataclasses import replace
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock, Thread
@@ -125,9 +127,10 @@ class LiveMap:
         self._check()
         if self._over:
             raise SourceError("the drive is over: nothing can be pushed any more")
-        images = np.array(left), np.array(right)
-        pair = StereoPair(*images, time_s, self._newest.pushed, f"pair {self._newest.pushed}")
-        if not (isinstance(time_s, float | int) and self._last_s < time_s < math.inf):
+        pair = StereoPair(
+            copy(left), copy(right), time_s, self._newest.pushed, f"pair {self._newest.pushed}"
+        )
+        if not (isinstance(time_s, Real) and self._last_s < time_s < math.inf):
             what, expected = "not the time of a later pair", f"seconds after {self._last_s:g}"
             raise SourceError(what, where=pair.name, got=time_s, expected=expected)
         height_px, width_px = pair.left.shape[:2]
