@@ -111,8 +111,8 @@ def test_images_may_be_changed_after_they_were_pushed(slow, street):
     (IMAGE.astype(np.float32), IMAGE, 2.0, ShapeError, "uint8"),
     (IMAGE.astype(np.uint16), IMAGE.astype(np.uint16), 2.0, ShapeError, "uint8"),
     (np.zeros((120, 320, 4), np.uint8), IMAGE, 2.0, ShapeError, "shape"),
-    (None, IMAGE, 2.0, ReconError, "left"),
-    ([[1, 2], [3]], IMAGE, 2.0, ReconError, "left"),
+    (None, IMAGE, 2.0, ShapeError, "not two images"),
+    ([[1, 2], [3]], IMAGE, 2.0, ShapeError, "not two images"),
 ])  # fmt: skip
 def test_what_is_no_pair_is_refused_and_the_drive_goes_on(
     slow, street, left, right, time_s, error, said
