@@ -1,8 +1,14 @@
 """`recon.LiveMap`: pairs in, pose and map out, for a program that has its own loop."""
 
+import runpy
+import sys
 import threading
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -10,10 +16,11 @@ import pytest
 import recon
 from recon.commands import live_map
 from recon.core.errors import CalibrationError, MappingError, ReconError, ShapeError, SourceError
+from recon.core.geometry.se3 import make_transform
 from recon.io.cameras.calibration import write_recon_calibration
 from recon.sources.live import PushedSource
 from recon.street.settings import StreetScene
-from tests.scenery.film import RIG, film
+from tests.scenery.film import RIG, Film, film
 from tests.scenery.patience import LONG_S
 
 SIZE = (120, 320)
@@ -202,3 +209,55 @@ def test_progress_is_shown_where_the_program_shows_it(slow, street):
         with recon.LiveMap(street.calibration) as live:
             live.push(IMAGE, IMAGE, 0.0)
     assert Shown.stages == ["look"]
+
+
+def stand_in(street: Film) -> MagicMock:
+    """Answer as either package does of a device that sees the street, and then Ctrl-C."""
+    camera, package = street.calibration, MagicMock()
+    pairs = [{"left": p.left[..., 1], "right": p.right[..., 1]} for p in street.pairs]
+    T_right_left = make_transform(np.eye(3), np.array([-camera.baseline_m, 0.0, 0.0]))
+    # Of depthai.
+    device = package.Pipeline.return_value.__enter__.return_value
+    kept = device.getDefaultDevice.return_value.readCalibration.return_value
+    kept.getCameraIntrinsics.return_value = camera.matrix.tolist()
+    kept.getDistortionCoefficients.return_value = [0.0] * 14
+    kept.getCameraExtrinsics.return_value = T_right_left.tolist()
+    queue = device.create.return_value.out.createOutputQueue.return_value
+    queue.get.side_effect = [
+        {side: MagicMock(**{"getTimestamp.return_value": timedelta(seconds=0.1 * n),
+                            "getCvFrame.return_value": pair[side]}) for side in pair}
+        for n, pair in enumerate(pairs)
+    ] + [KeyboardInterrupt]  # fmt: skip
+    # Of pyrealsense2.
+    stream = package.pipeline.return_value.start.return_value.get_stream.return_value
+    seen = stream.as_video_stream_profile.return_value
+    seen.get_extrinsics_to.return_value.translation = T_right_left[:3, 3].tolist()
+    lens = {"fx": camera.focal_px, "ppx": camera.cx_px, "ppy": camera.cy_px}
+    seen.get_intrinsics.return_value = SimpleNamespace(**lens)
+    frames = [MagicMock(**{"get_timestamp.return_value": 100.0 * n}) for n in range(len(pairs))]
+    for frame, pair in zip(frames, pairs, strict=True):
+        frame.get_infrared_frame.side_effect = [
+            MagicMock(**{"get_data.return_value": image}) for image in pair.values()
+        ]
+    package.pipeline.return_value.wait_for_frames.side_effect = [*frames, KeyboardInterrupt]
+    return package
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("example", "package", "size"), [
+    ("05_depthai", "depthai", ("SIZE",)),
+    ("06_realsense", "pyrealsense2", ("WIDTH_PX", "HEIGHT_PX"))
+])  # fmt: skip
+def test_an_example_maps_what_its_camera_sees(
+    street, example, package, size, blank_figures, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setitem(sys.modules, package, stand_in(street))
+    monkeypatch.setattr(recon, "LiveMap", partial(recon.LiveMap, wait=True), raising=False)
+    path = Path(__file__).parents[2] / "examples" / f"{example}.py"
+    main = runpy.run_path(str(path))["main"]
+    pixels = (SIZE[1], SIZE[0])
+    sizes = [pixels] if len(size) == 1 else pixels
+    main.__globals__.update(zip(size, sizes, strict=True))
+    main(tmp_path / "run")
+    assert "tracking" in capsys.readouterr().out
+    assert (tmp_path / "run" / "map" / "grid.yaml").is_file()
