@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock, Thread
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from recon.commands.config import ReconConfig, load_config
 from recon.commands.localize import run_live
 from recon.commands.map_options import MapOptions
 from recon.commands.map_summary import MapSummary
-from recon.core.errors import MappingError, SourceError
+from recon.core.errors import MappingError, ShapeError, SourceError
 from recon.core.values import (
     OccupancyGrid,
     PointCloud,
@@ -125,15 +126,20 @@ class LiveMap:
         self._check()
         if self._over:
             raise SourceError("the drive is over: nothing can be pushed any more")
-        images = np.array(left), np.array(right)
-        pair = StereoPair(*images, time_s, self._newest.pushed, f"pair {self._newest.pushed}")
-        if not (isinstance(time_s, float | int) and self._last_s < time_s < math.inf):
+        number, name = self._newest.pushed, f"pair {self._newest.pushed}"
+        now_s = float(time_s) if isinstance(time_s, int | float | np.number) else math.nan
+        if not self._last_s < now_s < math.inf:
             what, expected = "not the time of a later pair", f"seconds after {self._last_s:g}"
-            raise SourceError(what, where=pair.name, got=time_s, expected=expected)
+            raise SourceError(what, where=name, got=time_s, expected=expected)
+        images: tuple[Any, ...] = (left, right)
+        if not all(isinstance(one, np.ndarray) for one in images):
+            got = " and ".join(type(one).__name__ for one in images)
+            raise ShapeError("not two images", where=name, got=got, expected="uint8 arrays")
+        pair = StereoPair(left.copy(), right.copy(), now_s, number, name)
         height_px, width_px = pair.left.shape[:2]
         source = self._begin(width_px, height_px) if self._source is None else self._source
         check_size(source.calibration, width_px, height_px, pair.name)
-        self._last_s, self._newest.pushed = time_s, self._newest.pushed + 1
+        self._last_s, self._newest.pushed = now_s, self._newest.pushed + 1
         source.push(pair)
         self._check()
 

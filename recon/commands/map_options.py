@@ -23,6 +23,7 @@ from recon.core.geometry.se3 import make_transform
 from recon.core.machine import versions
 from recon.core.values import Trajectory
 from recon.export.make import PRODUCTS, USUAL
+from recon.export.mcap import write_layout
 from recon.export.robot import RobotTopics
 from recon.io.files import StrPath, resolved
 from recon.io.ros.bag import write_bag
@@ -182,6 +183,7 @@ class MapOptions:
             if self.bag:
                 folder = run.path(PRODUCTS["mcap"].name)
                 writers.append(stack.enter_context(write_bag(folder, as_it_goes=True)))
+                write_layout(folder, self.namespace and f"{self.namespace}/")
             topics = RobotTopics(writers, self.namespace, stamp_ns=self.stamp_ns)
             yield replace(self, listener=topics) if writers else self
 

@@ -62,10 +62,15 @@ def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
             for frame, views in drive.frames(images.get(drive.session.number)):
                 drive.write(bag, frame, views)
                 frames += 1
-    layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/base_link", drives[0].base)
-    layout = layout.replace("DRIVE/", drives[0].name)
-    write_text(folder / "foxglove.json", layout)
+    write_layout(folder, drives[0].name, drives[0].base)
     return ExportResult(BagFigures(frames), warnings)
+
+
+def write_layout(folder: Path, name: str = "", base: str = "base_link") -> None:
+    """Write a layout of Foxglove beside a bag, for topics that begin with a name."""
+    layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/base_link", base)
+    layout = layout.replace("DRIVE/", name)
+    write_text(folder / "foxglove.json", layout)
 
 
 class _Drive:

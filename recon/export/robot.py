@@ -33,7 +33,7 @@ from recon.map.listener import DriveBegun, DriveListener, DrivePose
 from recon.map.localize.localizer import State
 
 _EVERY_NS: Final = NS_PER_S  # between two messages of the path, or on health, unless that changes
-_MOST_POSES: Final = 1000  # in a path: a message of 70 kB
+_MOST_POSES: Final = 300  # in a path: a message of 20 kB, which takes some milliseconds to make
 _IDLE: Final = 3.0  # times as long as the last map took is paused before the next one is made
 _LEVELS: Final = {
     State.TRACKING: 0, State.COASTING: 1, State.SEARCHING: 1, State.LOST: 2,
@@ -218,23 +218,23 @@ class _ThinPath:
     """A path of a bounded number of poses, the more apart the longer it is."""
 
     def __init__(self) -> None:
-        self._poses: list[tuple[int, Float64]] = []
+        self._places_m: list[Float64] = []
+        self._poses: list[dict[str, Any]] = []  # as they are in messages
         self._spacing_m = 0.0
 
     def add(self, time_ns: int, T_map_base: Float64) -> None:
-        if self._poses:
-            step_m = np.linalg.norm(T_map_base[:3, 3] - self._poses[-1][1][:3, 3])
-            if step_m < self._spacing_m:
-                return
-        self._poses.append((time_ns, T_map_base))
+        place_m = T_map_base[:3, 3]
+        if self._poses and np.linalg.norm(place_m - self._places_m[-1]) < self._spacing_m:
+            return
+        self._places_m.append(place_m)
+        self._poses.append({"header": header("map", time_ns), "pose": pose(T_map_base)})
         if len(self._poses) > _MOST_POSES:
-            self._poses = self._poses[::2]
-            places_m = np.stack([T[:3, 3] for _, T in self._poses])
-            self._spacing_m = float(np.linalg.norm(np.diff(places_m, axis=0), axis=1).mean())
+            self._poses, self._places_m = self._poses[::2], self._places_m[::2]
+            steps_m = np.linalg.norm(np.diff(self._places_m, axis=0), axis=1)
+            self._spacing_m = float(steps_m.mean())
 
     def message(self, time_ns: int) -> Message:
-        poses = [{"header": header("map", ns), "pose": pose(T)} for ns, T in self._poses]
-        return "nav_msgs/msg/Path", {"header": header("map", time_ns), "poses": poses}
+        return "nav_msgs/msg/Path", {"header": header("map", time_ns), "poses": self._poses}
 
 
 class _Guarded:

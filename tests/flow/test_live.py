@@ -1,6 +1,7 @@
 """`recon live` maps as `recon map` does where it keeps up; `recon localize` says where it is."""
 
 import csv
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,6 +19,7 @@ from recon.core.progress import Counted, Silent, showing
 from recon.core.renamed import with_former_keys
 from recon.core.values import RectifiedCamera
 from recon.io.cameras.calibration import read_calibration
+from recon.io.models.rasters import read_grid
 from recon.io.trajectory import read_tum
 from recon.map.drive.drive import MapBehind
 from recon.map.drive.mapper import FrameResult
@@ -29,6 +31,7 @@ from recon.rig.capture import (
     is_camera,
     open_camera_source,
 )
+from recon.run.finished import GRID
 from recon.sources import live
 from recon.sources.live import LiveSource
 from recon.sources.settings import SourceSettings
@@ -277,6 +280,28 @@ def test_the_map_file_alone_will_do_and_its_rig_is_begun_with(drive, even_map, t
     assert summary["frames_tracking"] >= 3
     assert summary["rig"]["begun_with"].startswith("session 0 (")
     assert (out / "rig.yaml").is_file()
+
+
+def test_what_a_robot_is_told_is_a_bag_in_the_run(drive, even_map, tmp_path):
+    highlevel, out = pytest.importorskip("rosbags.highlevel"), tmp_path / "found"
+    words = ("--map", even_map, "--start", "1", "--stride", "2", "--to", "mcap", "--out", out)
+    done = run("localize", drive, *words)
+    assert done.code == 0, done.err
+    with highlevel.AnyReader([out / "bag"]) as bag:
+        seen = [(one.topic, bag.deserialize(raw, one.msgtype)) for one, _, raw in bag.messages()]
+    path = read_tum(out / "trajectory_map_base_tum.txt")
+    poses = [message.pose.pose.position for topic, message in seen if topic == "/pose"]
+    found_m = np.array([(at.x, at.y, at.z) for at in poses])
+    np.testing.assert_allclose(found_m, path.positions_m, atol=1e-6)
+    (grid,), kept = [m for topic, m in seen if topic == "/map"], read_grid(even_map / GRID)
+    assert grid.data.reshape(kept.cells.shape).tolist() == kept.cells.tolist()
+    assert {"/tf", "/tf_static", "/odometry", "/path", "/diagnostics", "/costmap", "/cloud"} <= {
+        topic for topic, _ in seen
+    }
+    layout = json.loads((out / "bag/foxglove.json").read_text())
+    assert layout["configById"]["3D!map"]["followTf"] == "base_link"
+    assert "bag/bag.mcap" in json.loads((out / "run.json").read_text())["files"]
+    assert_refused(run("localize", drive, *words[:-4], "--to", "grid"), "recon export makes it")
 
 
 def test_a_drive_elsewhere_gets_a_warning_and_no_pose(even_map, tmp_path):

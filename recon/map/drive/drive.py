@@ -84,7 +84,7 @@ class Drive:
 
     def tell(self, frame: FrameResult) -> None:
         """Tell the listener where a frame is, once the map has axes."""
-        if self.mapper.axes is not None:
+        if self.mapper.axes is not None and self._listener is not NOBODY:
             at = (frame.time_s, frame.T_world_camera, frame.health)
             self._listener.on_pose(self._teller.mapped(*at, *self.mapper.axes))
 
