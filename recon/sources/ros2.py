@@ -217,7 +217,7 @@ class Ros2Source(StereoSource):
         """Yield images that belong together: each is the nearest of the other camera."""
         tolerance_ns = round(self._settings.tolerance_s / NS)
         left, right = (self._waiting[topic] for topic in self.images)
-        told_s = time.monotonic()
+        paired_s, quiet_s = time.monotonic(), _QUIET_S
         for _ in self._messages():
             while left and right:
                 late_ns = right[0].stamp_ns - left[0].stamp_ns
@@ -230,12 +230,12 @@ class Ros2Source(StereoSource):
                     self._alone += self._counting
                     continue
                 self._counting = True
-                told_s, self._paired_ns = time.monotonic(), left[0].stamp_ns
+                paired_s, self._paired_ns = time.monotonic(), left[0].stamp_ns
                 yield left.popleft(), right.popleft()
-            if time.monotonic() - told_s > _QUIET_S:
-                told_s = float("inf")
+            if time.monotonic() - paired_s > quiet_s:
                 waiting = ", ".join(f"{len(self._waiting[one])} of {one}" for one in self.images)
-                LOGGER.warning("no pair for %.0f s; images that wait: %s", _QUIET_S, waiting)
+                LOGGER.warning("no pair for %.0f s; images that wait: %s", quiet_s, waiting)
+                quiet_s *= 2  # who is told each time reads none of it
 
     def _messages(self) -> Iterator[None]:
         """Take what arrives, until the drive is stopped."""
