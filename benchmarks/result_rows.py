@@ -278,8 +278,9 @@ def ros2(found: Found) -> Rows:
     one = found["drive"]
     rows: Rows = {"image of 466 kB to an array": one["image_ms"]}
     for name, played in (("recording", one["files"]), ("topics", one["ros2"])):
-        dropped = {"dropped": played["frames_dropped"]}
-        rows[f"{name}: image to pose"] = {**played["latency_ms"], **dropped}
+        used = {"dropped": "frames_dropped", "cores": "cores", "memory": "peak_memory_mb"}
+        cost = {column: played[key] for column, key in used.items()}
+        rows[f"{name}: image to pose"] = {**played["latency_ms"], **cost}
     return {**rows, "topics: stamp to a listener": one["ros2"]["to_listener_ms"]}
 
 

@@ -128,7 +128,8 @@ TABLES: Final[dict[str, Table]] = {
     ),
     "ros2": Table(
         {"drive": f"python benchmarks/ros2.py {D13} --json"},
-        {"p50": "{:.1f} ms", "p95": "{:.1f} ms", "max": "{:.1f} ms", "dropped": "{}"},
+        {"p50": "{:.1f} ms", "p95": "{:.1f} ms", "max": "{:.1f} ms", "dropped": "{}"}
+        | {"cores": "{:.1f}", "memory": MB},
         rows_of.ros2,
         timed=True,
     ),

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -67,11 +68,20 @@ def recon_live(words: Sequence[str]) -> list[str]:
 
 
 def ended(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """What a run says of itself when it ends."""
+    """What a run says of itself when it ends, and its processor time with what it started."""
+    before_s = processor_s()
     said, told = process.communicate(timeout=600)
     if process.returncode:
         raise SystemExit(told)
-    return dict(json.loads(said)["live"])
+    summary = json.loads(said)
+    own = {"cores": round((processor_s() - before_s) / summary["seconds"], 2)}
+    return {**summary["live"], **own, "peak_memory_mb": summary["peak_memory_mb"]}
+
+
+def processor_s() -> float:
+    """Processor time of all processes that this one started, and that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def over_network(drive: Path, out: Path, play: Sequence[str]) -> dict[str, Any]:
