@@ -20,9 +20,10 @@ from recon.io.ros import bag as bag_file
 from recon.io.ros.bag import write_bag
 from recon.io.ros.messages import NS_PER_S, Message, encode, transforms
 from recon.map.drive.drive import Workspace
+from recon.map.drive.drive_odometry import mount_of
 from recon.map.drive.sequence import map_sequence
 from recon.map.ground.axes import AXES_MAP_WORLD
-from recon.map.listener import DriveBegun, DriveListener, DrivePose, mount_of
+from recon.map.listener import DriveBegun, DriveListener, DrivePose
 from recon.map.localize.localizer import State
 from recon.map.map import Map
 from recon.map.sessions.placed import place_map
@@ -266,7 +267,7 @@ def test_a_time_that_messages_cannot_have_is_refused(time_s):
 def test_where_the_robot_says_its_camera_is_counts():
     source = Film([], CAMERA, np.zeros((0, 4, 4)))
     source.read_mount = lambda: Mount(T_BASE_CAMERA, "base_footprint", "stereo")
-    mount = mount_of(source, RectificationSettings())
+    mount, _ = mount_of(source, RectificationSettings())
     out = Written()
     topics = RobotTopics([out])
     topics.on_begin(begun(source, mount=mount))
