@@ -71,13 +71,18 @@ def watched(*, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
 
 
 class _Notes(logging.Handler):
-    """Writes what the library logs as a warning: above the bar, as an event, or a line."""
+    """Writes what the library logs as a warning: above the bar, as an event, or a line.
+
+    What is ``passing`` is of no use to who reads it later, and is for terminals alone.
+    """
 
     def __init__(self, viewer: Shown) -> None:
         super().__init__(logging.WARNING)
         self._viewer = viewer
 
     def emit(self, record: logging.LogRecord) -> None:
+        if getattr(record, "passing", False) and not isinstance(self._viewer, ProgressBar):
+            return
         if isinstance(self._viewer, JsonLines):
             self._viewer.on_note(record.getMessage())
         else:

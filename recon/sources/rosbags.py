@@ -29,7 +29,7 @@ from recon.io.ros.contents import (
     imu_row,
     poses_of,
 )
-from recon.io.ros.messages import EXTRA, NS_PER_S
+from recon.io.ros.messages import NS_PER_S
 from recon.sources.topics import Topic
 
 
@@ -40,8 +40,8 @@ class Bag:
         self.paths = tuple(paths)
         self._ros1 = self.paths[0].suffix == ".bag"
         module = "rosbags.rosbag1" if self._ros1 else "rosbags.rosbag2"
-        self._reader = require(module, extra=EXTRA).Reader
-        typesys = require("rosbags.typesys", extra=EXTRA)
+        self._reader = require(module, extra="ros").Reader
+        typesys = require("rosbags.typesys", extra="ros")
         store = typesys.Stores.ROS1_NOETIC if self._ros1 else typesys.Stores.ROS2_HUMBLE
         self._store = typesys.get_typestore(store)
         for kind in TRANSFORMS:

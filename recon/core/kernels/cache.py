@@ -48,7 +48,8 @@ def announce(kernel: str) -> None:
 @cache
 def note_compiling() -> None:
     """Log, once, that kernels are compiled: whoever waits is to know why."""
-    LOGGER.warning("compiling kernels, once after an installation: those that this command needs …")
+    why = "compiling kernels, once after an installation: those that this command needs …"
+    LOGGER.warning(why, extra={"passing": True})
 
 
 def cache_parent() -> Path:

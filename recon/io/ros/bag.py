@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from recon.core.errors import require
 from recon.io.atomic import writing_to
-from recon.io.ros.messages import EXTRA, Message, encode, message_types
+from recon.io.ros.messages import Message, encode, message_types
 
 _FLUSH_S: Final = 1.0
 
@@ -47,7 +47,7 @@ class RosBag:
 def write_bag(folder: Path, *, as_it_goes: bool = False) -> Iterator[RosBag]:
     """Open a bag to be written: a new folder, in which a file of its name ends in ``.mcap``."""
     rosbag2, interfaces = (
-        require(f"rosbags.{name}", extra=EXTRA) for name in ("rosbag2", "interfaces")
+        require(f"rosbags.{name}", extra="ros") for name in ("rosbag2", "interfaces")
     )
     # What is beside the file is of version 9, which ROS 2 reads since Iron.
     how = {"version": 9, "storage_plugin": rosbag2.StoragePlugin.MCAP}

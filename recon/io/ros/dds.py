@@ -22,7 +22,6 @@ from recon.core.errors import FormatError, SettingsError, SourceError, require
 from recon.core.text import counted
 from recon.io.ros.messages import Message, encode, message_types
 
-EXTRA: Final = "ros2"
 DOMAIN: Final = "ROS_DOMAIN_ID"
 _RANGE: Final = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _CYCLONE: Final = "CYCLONEDDS_URI"
@@ -119,7 +118,7 @@ class Network:
 
     def __init__(self, domain: int | None = None, configuration: str | None = None) -> None:
         names = ("domain", "core", "builtin", "topic", "pub", "sub", "util")
-        self._dds = {name: require(f"cyclonedds.{name}", extra=EXTRA) for name in names}
+        self._dds = {name: require(f"cyclonedds.{name}", extra="ros2") for name in names}
         self.domain = domain_of() if domain is None else domain
         own, self.reach = configuration_of()
         before = _sockets()
@@ -270,7 +269,7 @@ def _keep_inside(descriptors: set[int]) -> None:
 @cache
 def _domain(number: int, configuration: str) -> Any:
     """Begin a domain, once in a process, as Cyclone has it; "" = as the environment says."""
-    return require("cyclonedds.domain", extra=EXTRA).Domain(number, configuration or None)
+    return require("cyclonedds.domain", extra="ros2").Domain(number, configuration or None)
 
 
 def _is_whole(sample: Any) -> bool:
@@ -303,12 +302,12 @@ def _described(kind: str) -> Any:
     """Return the description of a message, which Cyclone checks bytes against."""
     package, name = kind.split("/msg/")
     fields = {field: _field(of) for field, of in message_types().fielddefs[kind][1]}
-    idl = require("cyclonedds.idl", extra=EXTRA)
+    idl = require("cyclonedds.idl", extra="ros2")
     return idl.make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", fields)
 
 
 def _field(definition: Any) -> Any:
-    types = require("cyclonedds.idl.types", extra=EXTRA)
+    types = require("cyclonedds.idl.types", extra="ros2")
     node, of = definition
     name = node.name
     if name == "NAME":

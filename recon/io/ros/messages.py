@@ -14,7 +14,6 @@ from recon.core.values import OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64
 from recon.io.models.columns import columns_of, table_of
 
-EXTRA: Final = "ros"
 NS_PER_S: Final = 1_000_000_000
 # Numbers of types in a PointField.
 _TYPES: Final = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
@@ -41,7 +40,7 @@ class MessageWriter(Protocol):
 @cache
 def message_types() -> Any:
     """Return the definitions of messages of ROS 2, from rosbags (extra ``ros``)."""
-    typesys = require("rosbags.typesys", extra=EXTRA)
+    typesys = require("rosbags.typesys", extra="ros")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     for name, text in _GRID_MAP.items():
         store.register(typesys.get_types_from_msg(text, f"grid_map_msgs/msg/{name}"))
