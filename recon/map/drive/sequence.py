@@ -80,9 +80,9 @@ class MappedSequence:
         seconds: Wall-clock time from the first frame to the last.
         loops, prior, imu, sfm: What came of loop closure, of an external trajectory, of an inertial
             unit, of structure from motion; None = they were not used.
-        doubts: Why what the robot says of where its camera is was not used.
         threads: Threads with which rays are cast.
         tracks: What a drive showed of its rig while it arrived; empty of any other.
+        doubts: Why what the robot says of where its camera is was not used.
     """
 
     map: Map
@@ -93,9 +93,9 @@ class MappedSequence:
     prior: UsedPrior | None = None
     imu: FittedImu | None = None
     sfm: FoundPoses | None = None
-    doubts: Sequence[str] = ()
     threads: int = 1
     tracks: Sequence[StereoTracks] = ()
+    doubts: Sequence[str] = ()
 
     def __repr__(self) -> str:
         trusted = int(self.trusted.sum())
