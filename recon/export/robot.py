@@ -87,7 +87,10 @@ class RobotTopics(DriveListener):
         if self._T_map_odom is not None:
             edges.append(("map", f"{self._frame}odom", self._T_map_odom))
         if T_odom_base is not None:
-            edges.append((f"{self._frame}odom", self._base, T_odom_base))
+            mount = self._begun.mount
+            root = self._base if mount is None else mount.root or mount.base
+            T_base_root = np.eye(4) if mount is None else mount.T_base_root
+            edges.append((f"{self._frame}odom", root, T_odom_base @ T_base_root))
             odometry = self._odometry(time_ns, found, T_odom_base)
             self._out.write(f"{self._topic}odometry", time_ns, odometry)
         if edges:

@@ -302,8 +302,21 @@ def find_mount(edges: Iterable[BagPose], camera: str) -> Mount | None:
     names = sorted({name for edge in known for name in (edge.parent, edge.child)} - {camera})
     for base in (name for last in BASES for name in names if name.rpartition("/")[2] == last):
         if (T_base_camera := static_transform(known, base, camera)) is not None:
-            return Mount(T_base_camera, base, camera)
+            found, root = Mount(T_base_camera, base, camera), _root_above(base, known)
+            T_base_root = static_transform(known, base, root)
+            return (
+                found if T_base_root is None else replace(found, root=root, T_base_root=T_base_root)
+            )
     return None
+
+
+def _root_above(base: str, edges: Sequence[BagPose]) -> str:
+    """Return the frame that has a base below it and no parent; "" = the base itself."""
+    parents = {edge.child: edge.parent for edge in edges}
+    way = [base]
+    while (parent := parents.get(way[-1])) is not None and parent not in way:
+        way.append(parent)
+    return "" if len(way) == 1 else way[-1]
 
 
 def _static_edges(bag: Bag) -> list[BagPose]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -46,9 +46,14 @@ class Mount:
     T_base_camera: Float64
     base: str = "base_link"  # name of the frame of the robot
     camera: str = "left"  # name of the frame of the images
+    # The frame that all others hang from, and where it is in the base; "" = the base itself. It is
+    # what odometry moves: a frame has one parent.
+    root: str = ""
+    T_base_root: Float64 = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
         freeze(self, "T_base_camera", np.float64, (4, 4))
+        freeze(self, "T_base_root", np.float64, (4, 4))
 
     @property
     def camera_height_m(self) -> float | None:

@@ -264,6 +264,18 @@ def test_a_time_that_messages_cannot_have_is_refused(time_s):
         topics.on_pose(replace(drive_pose(0, None), time_s=time_s))
 
 
+def test_a_frame_that_has_a_parent_on_the_robot_gets_no_other():
+    T_base_root = make_transform(np.eye(3), np.array([0.0, 0.0, 0.3]))
+    mount = Mount(T_BASE_CAMERA, "base_footprint", "cam", "base_link", T_base_root)
+    out = Written()
+    topics = RobotTopics([out])
+    topics.on_begin(begun(mount=mount))
+    topics.on_pose(drive_pose(0, None))
+    found = tree(out.of("/tf")[0])
+    assert "odom>base_footprint" not in found
+    np.testing.assert_allclose(found["odom>base_link"][2, 3], 0.3, atol=1e-9)
+
+
 def test_where_the_robot_says_its_camera_is_counts():
     source = Film([], CAMERA, np.zeros((0, 4, 4)))
     source.read_mount = lambda: Mount(T_BASE_CAMERA, "base_footprint", "stereo")

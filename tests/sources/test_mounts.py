@@ -132,3 +132,17 @@ def test_the_mount_is_of_the_rectified_view_of_a_raw_camera():
     assert said.startswith("transforms of the robot not used: a static transform is no motion")
     for other in (SourcePart(Raw(), 0, 2), LiveSource(Raw())):
         np.testing.assert_array_equal(other.read_mount().T_base_camera, A)
+
+
+def test_what_the_base_hangs_from_is_what_odometry_moves():
+    below = [edge("base_link", "base_footprint", A), edge("base_link", "cam", B)]
+    found = find_mount(below, "cam")
+    assert found is not None
+    assert (found.base, found.root) == ("base_footprint", "base_link")
+    np.testing.assert_allclose(found.T_base_root, invert(A), atol=1e-12)
+    above = [edge("base_footprint", "base_link", A), edge("base_link", "cam", B)]
+    found = find_mount(above, "cam")
+    assert found is not None
+    assert (found.base, found.root) == ("base_footprint", "")
+    circle = [*above, edge("cam", "base_footprint", A)]
+    assert find_mount(circle, "cam") is not None
