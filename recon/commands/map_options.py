@@ -182,8 +182,10 @@ class MapOptions:
                 folder = run.path(PRODUCTS["mcap"].name)
                 writers.append(stack.enter_context(write_bag(folder, as_it_goes=True)))
                 write_layout(folder, self.namespace and f"{self.namespace}/")
-            topics = RobotTopics(writers, self.namespace)
-            yield replace(self, listener=topics) if writers else self
+            if not writers:
+                yield self
+            else:
+                yield replace(self, listener=RobotTopics(writers, self.namespace))
 
     def begin(self, run: Run, source: StereoSource, config: ReconConfig) -> Map:
         """Begin the map of a run; of one that is resumed, open it if nothing has changed."""

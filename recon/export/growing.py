@@ -29,7 +29,6 @@ from recon.map.store.session import Session
 class MapSoFar:
     """What was made of a map."""
 
-    time_s: float  # of its last frame
     grid: OccupancyGrid
     costs: OccupancyGrid | None  # None = they cannot be made
     cloud: PointCloud  # new points, frame ``map``
@@ -69,8 +68,7 @@ class GrowingMap:
                 cloud = even_sample(placed.tiles)
             else:
                 cloud = join_clouds(submap_cloud(session, session.submaps[n]) for n in new)
-            time_s = float(session.trajectory.timestamps_s[-1])
-            return MapSoFar(time_s, self._grid, self._costs, cloud, note)
+            return MapSoFar(self._grid, self._costs, cloud, note)
 
 
 class MapBeside:
@@ -83,7 +81,7 @@ class MapBeside:
         self.finished = finished
         code = f"from {__name__} import _serve; _serve()"
         words, pipe = [sys.executable, "-c", code, str(path), str(int(finished))], subprocess.PIPE
-        self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe)
+        self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, start_new_session=True)
 
     def update(self) -> MapSoFar | None:
         """Wait for the map with what is new in it; None = there is nothing."""
