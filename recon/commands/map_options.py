@@ -181,7 +181,7 @@ class MapOptions:
             if self.bag:
                 folder = run.path(PRODUCTS["mcap"].name)
                 writers.append(stack.enter_context(write_bag(folder, as_it_goes=True)))
-                write_layout(folder, self.namespace and f"{self.namespace}/")
+                write_layout(folder, self.namespace and f"{self.namespace}/", live=True)
             if not writers:
                 yield self
             else:

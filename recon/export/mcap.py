@@ -66,9 +66,14 @@ def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
     return ExportResult(BagFigures(frames), warnings)
 
 
-def write_layout(folder: Path, name: str = "") -> None:
-    """Write a layout of Foxglove beside a bag, for topics and frames that begin with a name."""
+def write_layout(folder: Path, name: str = "", *, live: bool = False) -> None:
+    """Write a layout of Foxglove beside a bag, for topics and frames that begin with a name.
+
+    Those of ``live`` topics have the map under other names.
+    """
     layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/", name)
+    if live:
+        layout = layout.replace("/map/grid", f"/{name}map").replace("/map/cloud", f"/{name}cloud")
     write_text(folder / "foxglove.json", layout)
 
 
