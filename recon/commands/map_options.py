@@ -183,9 +183,13 @@ class MapOptions:
             if self.bag:
                 folder = run.path(PRODUCTS["mcap"].name)
                 writers.append(stack.enter_context(write_bag(folder, as_it_goes=True)))
-                write_layout(folder, self.namespace and f"{self.namespace}/")
-            topics = RobotTopics(writers, self.namespace, stamp_ns=self.stamp_ns)
-            yield replace(self, listener=topics) if writers else self
+                write_layout(folder, self.namespace and f"{self.namespace}/", live=True)
+            if not writers:
+                yield self
+            else:
+                yield replace(
+                    self, listener=RobotTopics(writers, self.namespace, stamp_ns=self.stamp_ns)
+                )
 
     def begin(self, run: Run, source: StereoSource, config: ReconConfig) -> Map:
         """Begin the map of a run; of one that is resumed, open it if nothing has changed."""

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import pickle
+import json
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, cast
+from typing import IO, Any, cast
 
 import numpy as np
 
 from recon.core.errors import MappingError, ReconError
 from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.values import UNKNOWN, OccupancyGrid, PointCloud, join_clouds
+from recon.core.values.arrays import tree_of
 from recon.core.work import serial_algebra, work_in_background
 from recon.export.cloud import even_sample
 from recon.export.costmap import make_costmap
@@ -23,13 +24,13 @@ from recon.map.cut import Rectangle
 from recon.map.map import Map
 from recon.map.sessions.placed import place_map, settings_of
 from recon.map.store.session import Session
+from recon.map.store.trees import from_bytes, to_bytes
 
 
 @dataclass(frozen=True, eq=False)
 class MapSoFar:
     """What was made of a map."""
 
-    time_s: float  # of its last frame
     grid: OccupancyGrid
     costs: OccupancyGrid | None  # None = they cannot be made
     cloud: PointCloud  # new points, frame ``map``
@@ -69,8 +70,7 @@ class GrowingMap:
                 cloud = even_sample(placed.tiles)
             else:
                 cloud = join_clouds(submap_cloud(session, session.submaps[n]) for n in new)
-            time_s = float(session.trajectory.timestamps_s[-1])
-            return MapSoFar(time_s, self._grid, self._costs, cloud, note)
+            return MapSoFar(self._grid, self._costs, cloud, note)
 
 
 class MapBeside:
@@ -83,12 +83,7 @@ class MapBeside:
         self.finished = finished
         code = f"from {__name__} import _serve; _serve()"
         words, pipe = [sys.executable, "-c", code, str(path), str(int(finished))], subprocess.PIPE
-        self._process = subprocess.Popen(
-            words,
-            stdin=pipe,
-            stdout=pipe,
-            start_new_session=True,  # Ctrl-C ends the drive first
-        )
+        self._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, start_new_session=True)
 
     def update(self) -> MapSoFar | None:
         """Wait for the map with what is new in it; None = there is nothing."""
@@ -96,12 +91,13 @@ class MapBeside:
         try:
             asked.write(b"\n")
             asked.flush()
-            found = pickle.load(answers)  # noqa: S301 - of our own process
-        except (EOFError, OSError) as error:
+            text = json.loads(answers.readline())
+        except (ValueError, OSError) as error:
             raise MappingError("the process that makes the map has ended") from error
-        if isinstance(found, ReconError):
-            raise found
-        return cast("MapSoFar | None", found)
+        found = from_bytes(text, lambda size: bytearray(answers.read(size)), 0)
+        if "error" in found:
+            raise MappingError(found["error"])
+        return _map_in(found) if found else None
 
     def close(self) -> None:
         """End the process, which may work on a map that nobody waits for."""
@@ -117,14 +113,22 @@ def _serve() -> None:
     answers = sys.stdout.buffer
     sys.stdout = sys.stderr
     for _ in sys.stdin:
-        found: MapSoFar | ReconError | None
         try:
             with serial_algebra():
-                found = growing.update()
+                found = tree_of(growing.update()) or {}
         except ReconError as error:
-            found = error
-        pickle.dump(found, answers, pickle.HIGHEST_PROTOCOL)
+            found = {"error": str(error)}
+        text, content = to_bytes(found, compress=False)
+        answers.writelines([json.dumps(text).encode(), b"\n", *content])
         answers.flush()
+
+
+def _map_in(tree: dict[str, Any]) -> MapSoFar:
+    grid, costs = (
+        one and OccupancyGrid(one["cells"], one["resolution_m"], tuple(one["origin_m"]))
+        for one in (tree["grid"], tree["costs"])
+    )
+    return MapSoFar(grid, costs, PointCloud(**tree["cloud"]), tree["note"])
 
 
 def _around(session: Session, new: range, reach_m: float) -> tuple[list[int], Rectangle]:

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from recon.core.errors import FormatError, ReconError
+from recon.core.errors import ReconError
 from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values.arrays import Float64, UInt8
 from recon.export.cloud import even_sample
@@ -18,7 +18,7 @@ from recon.export.product import DriveImages, ExportContext, ExportResult, Produ
 from recon.io.atomic import write_text
 from recon.io.images.image import encode_image
 from recon.io.ros.bag import RosBag, write_bag
-from recon.io.ros.messages import grid_message, header, points, pose, transforms
+from recon.io.ros.messages import grid_message, header, points, pose, stamp_of, transforms
 from recon.map.ground.axes import base_axes
 from recon.map.store.session import Session
 from recon.places.closure import USUAL, DrivePath
@@ -66,10 +66,17 @@ def mcap_product(context: ExportContext, folder: Path) -> ExportResult:
     return ExportResult(BagFigures(frames), warnings)
 
 
-def write_layout(folder: Path, name: str = "", base: str = "base_link") -> None:
-    """Write a layout of Foxglove beside a bag, for topics that begin with a name."""
+def write_layout(
+    folder: Path, name: str = "", base: str = "base_link", *, live: bool = False
+) -> None:
+    """Write a layout of Foxglove beside a bag, for topics and frames that begin with a name.
+
+    Those of ``live`` topics have the map under other names.
+    """
     layout = _LAYOUT.read_text(encoding="utf-8").replace("DRIVE/base_link", base)
     layout = layout.replace("DRIVE/", name)
+    if live:
+        layout = layout.replace("/map/grid", f"/{name}map").replace("/map/cloud", f"/{name}cloud")
     write_text(folder / "foxglove.json", layout)
 
 
@@ -84,10 +91,7 @@ class _Drive:
         T_map_world = context.map.first.T_map_world
         self._T_base_camera = base_axes(T_map_world, height_m, session.mount)
         path = session.trajectory
-        if not (path.timestamps_s[0] >= 0.0 and path.timestamps_s[-1] < 2.0**31):
-            what, got = "times of the frames do not fit into a bag", f"{path.timestamps_s[0]:g} s"
-            raise FormatError(what, where=session.where, got=got, expected="seconds since 1970")
-        self.times_ns = np.rint(1e9 * path.timestamps_s).astype(np.int64).tolist()
+        self.times_ns = [stamp_of(time_s, session.where) for time_s in path.timestamps_s.tolist()]
         T_camera_base = invert(self._T_base_camera)
         self._T_map_base = session.T_map_world @ path.T_world_camera @ T_camera_base
         self._variance = _variance(session)

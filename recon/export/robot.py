@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.errors import FormatError
 from recon.core.geometry.se3 import adjoint, as_step, invert, make_transform, step_covariance
 from recon.core.progress import LOGGER
 from recon.core.values.arrays import Float64
@@ -25,8 +24,10 @@ from recon.io.ros.messages import (
     MessageWriter,
     grid_message,
     header,
+    message_types,
     points,
     pose,
+    stamp_of,
     transforms,
 )
 from recon.map.listener import DriveBegun, DriveListener, DrivePose
@@ -56,6 +57,7 @@ class RobotTopics(DriveListener):
         *,
         stamp_ns: Callable[[float], int] | None = None,
     ) -> None:
+        message_types()  # which takes half a second the first time
         self._out = _Guarded(writers)
         name = prefix.strip("/")
         self._topic, self._frame = (f"/{name}/", f"{name}/") if name else ("/", "")
@@ -73,11 +75,13 @@ class RobotTopics(DriveListener):
         self._base = f"{self._frame}base_link" if mount is None else mount.base
         self._camera = f"{self._frame}left" if mount is None else f"{mount.camera}_rectified"
         if begun.map_path is not None:
-            grow = MapBeside(begun.map_path, finished=begun.in_map)
-            self._map = _MapTopics(self._out, self._topic, grow, self._stamp_ns)
+            made = MapBeside(begun.map_path, finished=begun.in_map)
+            self._map = _MapTopics(self._out, self._topic, made)
 
     def on_pose(self, found: DrivePose) -> None:
         time_ns = self._stamp_ns(found.time_s)
+        if self._map is not None:
+            self._map.now(time_ns)
         mounted, self._T_base_camera = self._T_base_camera, found.T_base_camera
         if mounted is None or not np.array_equal(mounted, found.T_base_camera):
             edges = self._mounted(found.T_base_camera)
@@ -144,9 +148,10 @@ class RobotTopics(DriveListener):
         speed, unsure = np.zeros(6), np.zeros((6, 6))
         unsure[0, 0] = -1.0  # as ROS says that something is not known
         health = found.health
-        if self._before is not None and not health.begins and math.isfinite(health.sigma_m):
-            passed_s = (time_ns - self._before[0]) / NS_PER_S
-            speed = as_step(invert(self._before[1]) @ T_odom_base) / passed_s
+        before_ns, T_odom_before = self._before or (time_ns, T_odom_base)
+        passed_s = (time_ns - before_ns) / NS_PER_S
+        if passed_s > 0 and not health.begins and math.isfinite(health.sigma_m):
+            speed = as_step(invert(T_odom_before) @ T_odom_base) / passed_s
             off = step_covariance(health.sigma_m, health.sigma_deg) / passed_s**2
             unsure = _of_base(off, found.T_base_camera)
         parts = (dict(zip("xyz", part.tolist(), strict=True)) for part in (speed[:3], speed[3:]))
@@ -195,14 +200,6 @@ class RobotTopics(DriveListener):
 
 
 _COUNTED: Final = ("frames_arrived", "frames_dropped", "frames_not_matched")
-
-
-def stamp_of(time_s: float) -> int:
-    """Return a time as ROS has it, in nanoseconds, or `FormatError`."""
-    if not 0.0 <= time_s < 2.0**31:
-        what = "times of the frames do not fit into messages of ROS"
-        raise FormatError(what, got=f"{time_s:g} s", expected="seconds since 1970")
-    return round(NS_PER_S * time_s)
 
 
 def _of_base(covariance: Float64, T_base_camera: Float64) -> Float64:
@@ -267,16 +264,18 @@ class _Guarded:
 class _MapTopics:
     """Writes the map as it grows, which is made a fraction of the time."""
 
-    def __init__(
-        self, out: _Guarded, topic: str, growing: MapBeside, stamp_ns: Callable[[float], int]
-    ) -> None:
-        self._out, self._topic, self._growing, self._stamp_ns = out, topic, growing, stamp_ns
+    def __init__(self, out: _Guarded, topic: str, growing: MapBeside) -> None:
+        self._out, self._topic, self._growing, self._now_ns = out, topic, growing, -1
         self.note = ""
         self.grown, self._over = Event(), Event()
-        if growing.finished:
-            self.grown.set()
         self._thread = Thread(target=self._work, name="map-topics", daemon=True)
         self._thread.start()
+
+    def now(self, time_ns: int) -> None:
+        """Note the time of the drive; a map that is there is written when that is known."""
+        first, self._now_ns = self._now_ns < 0, time_ns
+        if first and self._growing.finished:
+            self.grown.set()
 
     def end(self) -> None:
         """Write the last of it."""
@@ -298,10 +297,9 @@ class _MapTopics:
             self._over.wait(_IDLE * (time.monotonic() - begun_s))
 
     def _write(self) -> None:
-        new = self._growing.update()
-        if new is None:
+        time_ns, name, new = self._now_ns, self._topic, self._growing.update()
+        if new is None or time_ns < 0:
             return
-        time_ns, name = self._stamp_ns(new.time_s), self._topic
         self.note = new.note
         self._out.write(f"{name}map", time_ns, grid_message(time_ns, new.grid), kept=True)
         if new.costs is not None:

@@ -299,7 +299,9 @@ def test_what_a_robot_is_told_is_a_bag_in_the_run(drive, even_map, tmp_path):
         topic for topic, _ in seen
     }
     layout = json.loads((out / "bag/foxglove.json").read_text())
-    assert layout["configById"]["3D!map"]["followTf"] == "base_link"
+    shown = layout["configById"]["3D!map"]
+    assert shown["followTf"] == "base_link"
+    assert {"/map", "/cloud", "/odometry"} <= set(shown["topics"])
     assert "bag/bag.mcap" in json.loads((out / "run.json").read_text())["files"]
     assert_refused(run("localize", drive, *words[:-4], "--to", "grid"), "recon export makes it")
 

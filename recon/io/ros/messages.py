@@ -8,7 +8,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from recon.core.errors import require
+from recon.core.errors import FormatError, require
 from recon.core.geometry.se3 import make_transform, quaternion_from_rotation
 from recon.core.values import OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64
@@ -65,6 +65,14 @@ def _made(kind: str, values: Mapping[str, Any]) -> Any:
             value = "" if of[0] == "string" else 0
         parts[name] = value
     return store.types[kind](**parts)
+
+
+def stamp_of(time_s: float, where: str | None = None) -> int:
+    """Return a time as messages have it, in nanoseconds, or `FormatError`."""
+    if not 0.0 <= time_s < 2.0**31:
+        what, got = "times of the frames do not fit into messages of ROS", f"{time_s:g} s"
+        raise FormatError(what, where=where, got=got, expected="seconds since 1970")
+    return round(NS_PER_S * time_s)
 
 
 def header(frame: str, time_ns: int) -> dict[str, Any]:
