@@ -1,4 +1,4 @@
-"""The occupancy of a map as files: an OctoMap in 3-D, a flat grid for navigation."""
+"""The occupancy of a map as files: OctoMap and distances in 3-D, a flat grid for navigation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,12 @@ from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64, Int32
 from recon.core.values.grid import log_odds
 from recon.export.product import ExportContext, ExportResult, ProductFigures
+from recon.io.models.columns import write_npz
 from recon.io.models.octomap import write_octomap_tiles
 from recon.io.models.rasters import write_nav2
 from recon.map.builders import MIN_PROBABILITY
 from recon.map.cut import Rectangle, TileKey
+from recon.map.esdf import DistanceField
 from recon.map.ground.axes import base_axes
 from recon.map.ground.grid import (
     DrivenPath,
@@ -78,6 +80,15 @@ class OctomapFigures(ProductFigures):
     """The voxels that were observed, undecided ones included."""
 
     voxels: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class EsdfFigures(ProductFigures):
+    """The voxels that have a signed distance, and where distances end."""
+
+    esdf_occupied: int
+    esdf_free: int
+    max_distance_m: float
 
 
 def grid_product(context: ExportContext, path: Path) -> ExportResult:
@@ -281,3 +292,40 @@ def octomap_product(context: ExportContext, path: Path) -> ExportResult:
     except MappingError as error:
         warnings.append(f"no OctoMap: {error}")
     return ExportResult(OctomapFigures(sum(len(tile.voxels) for tile in tiles)), warnings)
+
+
+def esdf_product(context: ExportContext, path: Path) -> ExportResult:
+    """Write an archive of NumPy: the signed distance of the centre of each known voxel.
+
+    ``cells`` int32 (N, 3), counted from ``origin_m`` (3,) in map axes, below ``shape`` (3,);
+    ``distance_m`` float32 (N,) and ``state`` int8 (N,), FREE or OCCUPIED. What is not listed is
+    unknown.
+    """
+    field, tiles = DistanceField(context.placed.tiles), context.placed.tiles
+    heights = (tile.voxels.keys[:, 2] for tile in tiles)
+    bottoms, tops = zip(*((z.min(), z.max() + 1) for z in heights if len(z)), strict=True)
+    low = np.array([*tiles.extent[0], min(bottoms)])
+    high = np.array([*tiles.extent[1], max(tops)])
+    counts = np.zeros(2, np.int64)
+
+    def parts() -> Iterator[dict[str, NDArray[Any]]]:
+        for tile in tiles:
+            keys, distance_m = field.of_tile(tile.key)
+            counts[:] += (distance_m < 0).sum(), (distance_m > 0).sum()
+            state = np.where(distance_m < 0, OCCUPIED, FREE).astype(np.int8)
+            cells = (keys - low).astype(np.int32)
+            yield {"cells": cells, "distance_m": distance_m, "state": state}
+            tiles.config.memory.check("measuring distances")
+
+    whole = {
+        "shape": high - low,
+        "origin_m": low * tiles.resolution_m,
+        "resolution_m": np.float64(tiles.resolution_m),
+        "max_distance_m": np.float64(field.max_distance_m),
+    }
+    write_npz(path, parts(), {name: np.asarray(one) for name, one in whole.items()})
+    occupied, free = counts.tolist()
+    figures = EsdfFigures(
+        esdf_occupied=occupied, esdf_free=free, max_distance_m=field.max_distance_m
+    )
+    return ExportResult(figures)
