@@ -92,9 +92,18 @@ class EsdfFigures(ProductFigures):
 
 
 def grid_product(context: ExportContext, path: Path) -> ExportResult:
-    """Write the flat grid as Nav2 reads it, given the path of its YAML file."""
+    """Write the flat grid as Nav2 reads it, given the path of its YAML file.
+
+    Those of other bands of heights lie beside it, such as ``grid_0.5-2m.yaml``.
+    """
+    settings, stem = context.placed.tiles.config.grid, path.with_suffix("")
     grid, height_m, warnings = Flattening(context.placed).grid()
-    write_nav2(path.with_suffix(""), grid)
+    write_nav2(stem, grid)
+    for low_m, high_m in settings.heights_m:
+        band = settings.model_copy(update={"min_height_m": low_m, "max_height_m": high_m})
+        other, _, more = Flattening(context.placed, band).grid()
+        write_nav2(f"{stem}_{low_m:g}-{high_m:g}m", other)
+        warnings += more
     rows, columns = grid.cells.shape
     figures = GridFigures(
         resolution_m=grid.resolution_m,
