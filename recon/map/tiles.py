@@ -7,7 +7,7 @@ fused and filtered when it is first asked for, and then kept for all products.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from heapq import merge
 from itertools import groupby, product
@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.geometry.se3 import apply, transform_cloud
-from recon.core.kernels.voxels import are_among, distinct_keys, pack_keys, unpack_keys
+from recon.core.kernels.voxels import are_among, distinct_keys, find_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Float32, Float64, Int64
@@ -29,6 +29,7 @@ from recon.map.fusion import ALL, FusedPart, join_fused
 from recon.map.ground.surface import find_floors
 from recon.map.kernels.raycast import BLOCK_BITS
 from recon.map.occupancy.bodies import FrameObservations
+from recon.map.occupancy.gone import find_gone
 from recon.map.occupancy.moving import CellEvidence, cell_evidence, find_moved
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
@@ -38,6 +39,7 @@ _POINTS: Final = "points"
 _VOXELS: Final = "voxels"
 _FLOORS: Final = "floors"
 _REMOVED: Final = "removed"
+_GONE: Final = "gone"
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,7 @@ class Tiles:
         """
         if self._parts.numbers(OCCUPANCY, key) and not self._parts.numbers(_VOXELS, key):
             joined = self._chain.joined(key, note=self.config.fusion.remove_moving)
-            voxels = joined.voxels(self.resolution_m)
+            voxels = self._without_gone(key, joined.voxels(self.resolution_m))
             self._parts.put(_VOXELS, key, {"keys": voxels.keys, "log_odds": voxels.log_odds})
             self.config.memory.check("putting the occupancy together")
         found = self._parts.read(_VOXELS, key)
@@ -188,7 +190,29 @@ class Tiles:
             return voxels
         wide = self.bounds(key).wider(self._cutter.grid_margin_m)
         inside = {n: p.select(wide.contains(self._cutter.centres_m(p))) for n, p in after.items()}
-        return self._chain.changed(key, voxels, inside)
+        return self._less(key, self._chain.changed(key, voxels, inside))
+
+    def _without_gone(self, key: TileKey, voxels: OccupancyVoxels) -> OccupancyVoxels:
+        """Find what left a tile and was not looked through; it is neither occupied nor free."""
+        if self.config.fusion.remove_moving and self.observations is not None and len(voxels):
+            occupied = voxels.select(voxels.log_odds > 0)
+            wide = self.bounds(key).wider(self._cutter.grid_margin_m)
+            views = self.observations.views(np.array(wide.low), np.array(wide.high))
+            keys = occupied.keys[find_gone(occupied, views)]
+            self._parts.put(_GONE, key, {"cells": np.sort(pack_keys(keys))})
+        return self._less(key, voxels)
+
+    def _less(self, key: TileKey, voxels: OccupancyVoxels) -> OccupancyVoxels:
+        """Return voxels of a tile, those that left undecided."""
+        gone = find_keys(pack_keys(voxels.keys), self._gone(key))[1]
+        return replace(
+            voxels, log_odds=np.where(gone, np.minimum(voxels.log_odds, 0), voxels.log_odds)
+        )
+
+    def _gone(self, key: TileKey) -> Int64:
+        """Return the packed voxels of a tile that left, sorted."""
+        found = [tree["cells"] for _, tree in self._parts.read(_GONE, key)]
+        return np.concatenate([np.zeros(0, np.int64), *found])
 
     def cloud_in(self, rectangle: Rectangle) -> PointCloud:
         clouds = map(self.cloud, self._parts.under(rectangle))
@@ -242,6 +266,8 @@ class Tiles:
                 voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
                 sigma_m = fused.frame_sigma_m
                 moved = find_moved(points, sigma_m, counted, voxels, evidence, self.observations)
+                cells = np.floor(points / self.resolution_m).astype(np.int64)
+                moved |= find_keys(pack_keys(cells), self._gone(key))[1]
             kept.append(fused.select(~moved))
             removed.append(fused.select(moved))
         cloud = drop_islands(self._exported(kept), self.config.map_filters.radius_m)
