@@ -82,7 +82,7 @@ class OctomapFigures(ProductFigures):
     voxels: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class EsdfFigures(ProductFigures):
     """The voxels that have a signed distance, and where distances end."""
 
@@ -306,14 +306,12 @@ def octomap_product(context: ExportContext, path: Path) -> ExportResult:
 def esdf_product(context: ExportContext, path: Path) -> ExportResult:
     """Write an archive of NumPy: the signed distance of the centre of each known voxel.
 
-    ``cells`` int32 (N, 3), counted from ``origin_m`` (3,) in map axes, below ``shape`` (3,);
-    ``distance_m`` float32 (N,) and ``state`` int8 (N,), FREE or OCCUPIED. What is not listed is
-    unknown.
+    What its arrays are: `docs/formats.md`. Memory holds a tile and its margin.
     """
     field, tiles = DistanceField(context.placed.tiles), context.placed.tiles
     heights = (tile.voxels.keys[:, 2] for tile in tiles)
     bottoms, tops = zip(*((z.min(), z.max() + 1) for z in heights if len(z)), strict=True)
-    low = np.array([*tiles.extent[0], min(bottoms)])
+    low = np.array([*tiles.extent[0], min(bottoms)], np.int32)
     high = np.array([*tiles.extent[1], max(tops)])
     counts = np.zeros(2, np.int64)
 
@@ -322,8 +320,7 @@ def esdf_product(context: ExportContext, path: Path) -> ExportResult:
             keys, distance_m = field.of_tile(tile.key)
             counts[:] += (distance_m < 0).sum(), (distance_m > 0).sum()
             state = np.where(distance_m < 0, OCCUPIED, FREE).astype(np.int8)
-            cells = (keys - low).astype(np.int32)
-            yield {"cells": cells, "distance_m": distance_m, "state": state}
+            yield {"cells": keys - low, "distance_m": distance_m, "state": state}
             tiles.config.memory.check("measuring distances")
 
     whole = {
@@ -334,7 +331,4 @@ def esdf_product(context: ExportContext, path: Path) -> ExportResult:
     }
     write_npz(path, parts(), {name: np.asarray(one) for name, one in whole.items()})
     occupied, free = counts.tolist()
-    figures = EsdfFigures(
-        esdf_occupied=occupied, esdf_free=free, max_distance_m=field.max_distance_m
-    )
-    return ExportResult(figures)
+    return ExportResult(EsdfFigures(occupied, free, field.max_distance_m))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -35,12 +35,9 @@ _NOWHERE: Final = 1e9
 _TINY: Final = 1e-9
 
 
-class _Around(NamedTuple):
-    """The known voxels of a tile and its margin, in cells."""
-
-    keys: Int64  # (N,), packed, sorted
-    occupied: Bool  # (N,)
-    trees: tuple[cKDTree, cKDTree]  # centres of the free voxels, and of the occupied ones
+_Around = tuple[Int64, Bool, cKDTree, cKDTree]
+"""Known voxels of a tile and its margin: packed and sorted (N,), which are occupied, and the
+centres of the free ones and of the occupied ones, in cells."""
 
 
 class DistanceField:
@@ -85,14 +82,15 @@ class DistanceField:
         packed, occupied = pack_keys(voxels.keys), voxels.log_odds > 0
         order = np.argsort(packed)
         free, full = (cKDTree(voxels.keys[one] + 0.5) for one in (~occupied, occupied))
-        return _Around(packed[order], occupied[order], (free, full))
+        return packed[order], occupied[order], free, full
 
     def _measured(self, around: _Around, places_m: Float64) -> tuple[Float64, Float64]:
         places = places_m / self.tiles.resolution_m
-        found, known = find_keys(pack_keys(np.floor(places).astype(np.int64)), around.keys)
-        inside = known & around.occupied[found] if len(around.keys) else known
+        keys, occupied, *trees = around
+        found, known = find_keys(pack_keys(np.floor(places).astype(np.int64)), keys)
+        inside = known & occupied[found] if len(keys) else known
         distance, gradient = np.full(len(places), np.nan), np.full(places.shape, np.nan)
-        for which, tree, sign in zip((inside, known & ~inside), around.trees, (-1, 1), strict=True):
+        for which, tree, sign in zip((inside, known & ~inside), trees, (-1, 1), strict=True):
             rows = np.flatnonzero(which)
             for some in np.split(rows, range(_AT_ONCE, len(rows), _AT_ONCE)):
                 away = self._away(tree, places[some])

@@ -88,12 +88,11 @@ class Map(MapFile):
     ) -> Float64 | tuple[Float64, Float64]:
         """Return how far places (3,) or (N, 3), map axes, are from the nearest occupied voxel.
 
-        float64 (N,), metres from the place itself to the cube of the voxel: a signed distance
-        field, negative in occupied voxels (to the nearest free one). NaN = unknown space, which
-        may hide what is nearer: `at` has the state of a place. Distances end at 5 m, times the
-        scale of the scene: so much means that or more. With ``gradient`` also theirs, float64
-        (N, 3): of length 1, away from the obstacle; 0 where distances end, NaN where unknown. The
-        first call cuts the map, as that of `at` does.
+        float64 (N,), metres to its cube, negative in occupied voxels (to the nearest free one).
+        NaN = unknown space, which may hide what is nearer. Distances end at 5 m, times the scale of
+        the scene: so much means that or more. With ``gradient`` also theirs, float64 (N, 3): of
+        length 1, away from the obstacle; 0 where distances end, NaN where unknown. The first call
+        cuts the map, as that of `at` does.
 
         Raises:
             ShapeError: They are no such numbers, or not finite.

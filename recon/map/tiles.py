@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.geometry.se3 import apply, transform_cloud
-from recon.core.kernels.voxels import are_among, distinct_keys, find_keys, pack_keys, unpack_keys
+from recon.core.kernels.voxels import are_among, distinct_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
 from recon.core.values import OccupancyVoxels, PointCloud, join_clouds, join_voxels
 from recon.core.values.arrays import Float32, Float64, Int64
@@ -29,7 +29,7 @@ from recon.map.fusion import ALL, FusedPart, join_fused
 from recon.map.ground.surface import find_floors
 from recon.map.kernels.raycast import BLOCK_BITS
 from recon.map.occupancy.bodies import FrameObservations
-from recon.map.occupancy.gone import find_gone
+from recon.map.occupancy.gone import GONE, find_gone
 from recon.map.occupancy.moving import CellEvidence, cell_evidence, find_moved
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
@@ -39,7 +39,6 @@ _POINTS: Final = "points"
 _VOXELS: Final = "voxels"
 _FLOORS: Final = "floors"
 _REMOVED: Final = "removed"
-_GONE: Final = "gone"
 
 
 @dataclass(frozen=True)
@@ -180,7 +179,10 @@ class Tiles:
         """
         if self._parts.numbers(OCCUPANCY, key) and not self._parts.numbers(_VOXELS, key):
             joined = self._chain.joined(key, note=self.config.fusion.remove_moving)
-            voxels = self._without_gone(key, joined.voxels(self.resolution_m))
+            voxels = joined.voxels(self.resolution_m)
+            if self.config.fusion.remove_moving and self.observations is not None and len(voxels):
+                gone = find_gone(voxels, self.observations.views(voxels.centres_m))
+                voxels = replace(voxels, log_odds=np.where(gone, GONE, voxels.log_odds))
             self._parts.put(_VOXELS, key, {"keys": voxels.keys, "log_odds": voxels.log_odds})
             self.config.memory.check("putting the occupancy together")
         found = self._parts.read(_VOXELS, key)
@@ -190,29 +192,7 @@ class Tiles:
             return voxels
         wide = self.bounds(key).wider(self._cutter.grid_margin_m)
         inside = {n: p.select(wide.contains(self._cutter.centres_m(p))) for n, p in after.items()}
-        return self._less(key, self._chain.changed(key, voxels, inside))
-
-    def _without_gone(self, key: TileKey, voxels: OccupancyVoxels) -> OccupancyVoxels:
-        """Find what left a tile and was not looked through; it is neither occupied nor free."""
-        if self.config.fusion.remove_moving and self.observations is not None and len(voxels):
-            occupied = voxels.select(voxels.log_odds > 0)
-            wide = self.bounds(key).wider(self._cutter.grid_margin_m)
-            views = self.observations.views(np.array(wide.low), np.array(wide.high))
-            keys = occupied.keys[find_gone(occupied, views)]
-            self._parts.put(_GONE, key, {"cells": np.sort(pack_keys(keys))})
-        return self._less(key, voxels)
-
-    def _less(self, key: TileKey, voxels: OccupancyVoxels) -> OccupancyVoxels:
-        """Return voxels of a tile, those that left undecided."""
-        gone = find_keys(pack_keys(voxels.keys), self._gone(key))[1]
-        return replace(
-            voxels, log_odds=np.where(gone, np.minimum(voxels.log_odds, 0), voxels.log_odds)
-        )
-
-    def _gone(self, key: TileKey) -> Int64:
-        """Return the packed voxels of a tile that left, sorted."""
-        found = [tree["cells"] for _, tree in self._parts.read(_GONE, key)]
-        return np.concatenate([np.zeros(0, np.int64), *found])
+        return self._chain.changed(key, voxels, inside)
 
     def cloud_in(self, rectangle: Rectangle) -> PointCloud:
         clouds = map(self.cloud, self._parts.under(rectangle))
@@ -266,8 +246,6 @@ class Tiles:
                 voxels, evidence = self.wide_voxels(key), self._chain.evidence(key, drive)
                 sigma_m = fused.frame_sigma_m
                 moved = find_moved(points, sigma_m, counted, voxels, evidence, self.observations)
-                cells = np.floor(points / self.resolution_m).astype(np.int64)
-                moved |= find_keys(pack_keys(cells), self._gone(key))[1]
             kept.append(fused.select(~moved))
             removed.append(fused.select(moved))
         cloud = drop_islands(self._exported(kept), self.config.map_filters.radius_m)
@@ -335,7 +313,10 @@ class DriveChain:
         # Whether a surface crosses a voxel depends on what hit the blocks that touch its own.
         changed, needed = _grown(blocks, 1), _grown(blocks, 2)
         joined = _outdone(part for _, part in self._drives(key, after, needed))
-        anew = joined.voxels(seen.resolution_m, changed)
+        anew, packed = joined.voxels(seen.resolution_m, changed), pack_keys(seen.keys)
+        gone = are_among(pack_keys(anew.keys), packed[seen.log_odds == GONE])
+        most = np.where(gone, GONE, np.float32(np.inf))
+        anew = replace(anew, log_odds=np.minimum(anew.log_odds, most))
         kept = seen.select(~are_among(pack_keys(seen.keys >> BLOCK_BITS), changed))
         return join_voxels([kept, anew], seen.resolution_m)
 

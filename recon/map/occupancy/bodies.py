@@ -194,9 +194,10 @@ class FrameObservations:
         for frame in self._near(low, high, self.settings.max_range_m):
             yield self._read(int(frame)).cloud(), self.T_map_camera[frame]
 
-    def views(self, low: Float64, high: Float64) -> Iterator[FrameView]:
-        """Yield the views of frames near a rectangle, in order; none if cameras are not known."""
-        for frame in self._near(low, high, self.settings.max_range_m) if self._cameras else ():
+    def views(self, places_m: Float64) -> Iterator[FrameView]:
+        """Yield the views of frames near places (N, 3), in order; none if cameras are unknown."""
+        ends = places_m.min(axis=0), places_m.max(axis=0)
+        for frame in self._near(*ends, self.settings.max_range_m) if self._cameras else ():
             yield self._read(int(frame)), self.T_map_camera[frame], self._cameras[frame]
 
     def _near(self, low: Float64, high: Float64, reach_m: float) -> Int64:

@@ -11,8 +11,8 @@ needs nine of them after it was hit last. Then it is unknown, not free: nothing 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Final, NamedTuple
+from collections.abc import Iterable
+from typing import Final
 
 import cv2
 import numpy as np
@@ -39,7 +39,10 @@ a surface then falls to 1/√2 · cos 30° = 0.61 at the most."""
 _LESS: Final = 0.5
 _SIGMAS: Final = 2.0
 _PLAINEST: Final = 0.05  # fraction of the squares of an image
+_PROBABILITIES: Final = MIN_PROBABILITY, MAX_PROBABILITY, HIT_PROBABILITY, MISS_PROBABILITY
 _AROUND: Final = np.ones((3, 3), np.uint8)
+GONE: Final = np.float32(0)
+"""Log-odds of a voxel that left: exactly even, as no sum of what rays say is."""
 FrameView = tuple[RayCloud, Float64, RectifiedCamera]
 """Rays of a frame with its texture, ``T_map_camera``, and its camera."""
 
@@ -59,69 +62,49 @@ def texture_of(image: UInt8, valid: Bool | None) -> UInt8:
     return np.asarray(found, np.uint8)
 
 
-def find_gone(voxels: OccupancyVoxels, views: Iterator[FrameView]) -> Bool:
+def find_gone(voxels: OccupancyVoxels, views: Iterable[FrameView]) -> Bool:
     """Return bool (N,), the voxels that left, by the views of all frames near, in their order."""
-    looks = _Looks(voxels.centres_m, voxels.resolution_m)
-    for view in views:
-        if view[0].texture.size and len(view[0]):
-            looks.add(*view)
-    return looks.gone
-
-
-class _Looks:
-    """What frames saw of places (N, 3), of which each may have a surface."""
-
-    def __init__(self, places_m: Float64, resolution_m: float) -> None:
-        self._places, self._resolution_m = places_m, resolution_m
-        self._hits, self._texture = np.zeros((2, len(places_m)))
-        self._from = np.ones_like(places_m)  # from where each was hit last, relative to it
-        self._log_odds = np.zeros(len(places_m))
-
-    @property
-    def gone(self) -> Bool:
-        return np.asarray((self._hits > 0) & (self._log_odds <= 0))
-
-    def add(self, rays: RayCloud, T_map_camera: Float64, camera: RectifiedCamera) -> None:
-        """Add a frame, of which there are rays and texture."""
-        view = _seen_in(rays, camera)
-        ahead = apply(invert(T_map_camera), self._places)
+    places = voxels.centres_m
+    hits, texture_sum, state = np.zeros((3, len(voxels)))
+    seen_from = np.ones_like(places)  # from where each was hit last, relative to it
+    low, high, hit_more, missed = map(log_odds, _PROBABILITIES)
+    for rays, T, camera in views:
+        if not (rays.texture.size and len(rays)):
+            continue
+        near, far, before, texture, sigma = _seen_in(rays, camera)
+        ahead = apply(invert(T), places)
         rows, cell = _squares(ahead, camera, rays.texture.shape)
         inverse = 1 / ahead[rows, 2]
-        off = _SIGMAS * view.sigma + self._resolution_m * inverse**2
-        seen = (view.far[cell] - off <= inverse) & (inverse <= view.near[cell] + off)
-        hit, texture = rows[seen], view.texture[cell]
-        self._hits[hit] += 1
-        self._texture[hit] += texture[seen]
-        self._from[hit] = T_map_camera[:3, 3] - self._places[hit]
-        self._change(hit, HIT_PROBABILITY)
+        off = _SIGMAS * sigma + voxels.resolution_m * inverse**2
+        seen = (far[cell] - off <= inverse) & (inverse <= near[cell] + off)
+        hit = rows[seen]
+        hits[hit] += 1
+        texture_sum[hit] += texture[cell[seen]]
+        seen_from[hit] = T[:3, 3] - places[hit]
+        state[hit] = np.minimum(state[hit] + hit_more, high)
         # Nothing is there or before it, and less texture than on average when it was hit.
-        less = texture * self._hits[rows] <= _LESS * self._texture[rows]
-        less &= ~seen & (self._hits[rows] > 0) & (view.before[cell] < inverse - off)
-        rows = rows[less]
-        now, last = T_map_camera[:3, 3] - self._places[rows], self._from[rows]
-        length, before = np.linalg.norm(now, axis=1), np.linalg.norm(last, axis=1)
-        alike = np.abs(np.log(length / before)) <= math.log(_AS_FAR)
-        alike &= (now * last).sum(axis=1) >= _AS_SEEN * length * before
-        self._change(rows[alike], MISS_PROBABILITY)
-
-    def _change(self, rows: Int64, probability: float) -> None:
-        low, high = log_odds(MIN_PROBABILITY), log_odds(MAX_PROBABILITY)
-        self._log_odds[rows] = np.clip(self._log_odds[rows] + log_odds(probability), low, high)
+        less = texture[cell] * hits[rows] <= _LESS * texture_sum[rows]
+        rows = rows[less & ~seen & (hits[rows] > 0) & (before[cell] < inverse - off)]
+        rows = rows[_alike(T[:3, 3] - places[rows], seen_from[rows])]
+        state[rows] = np.maximum(state[rows] + missed, low)
+    return np.asarray((voxels.log_odds > 0) & (hits > 0) & (state <= 0))
 
 
-class _Seen(NamedTuple):
-    """Inverse depths, 1/m, that a frame saw in squares of its image (S,)."""
-
-    near: Float64  # largest, −inf where nothing was seen
-    far: Float64  # smallest, inf where nothing was seen
-    # Largest of what may hide the square: in those around it, and in the next ones with something
-    # on either side
-    before: Float64
-    sigma: float  # standard deviation
-    texture: Float64  # most in those around it: what a window of the matcher may have seen
+def _alike(now: Float64, last: Float64) -> Bool:
+    """Return which views of places (N, 3) from two sides show about the same of their surface."""
+    length, before = np.linalg.norm(now, axis=1), np.linalg.norm(last, axis=1)
+    as_far = np.abs(np.log(length / before)) <= math.log(_AS_FAR)
+    return np.asarray(as_far & ((now * last).sum(axis=1) >= _AS_SEEN * length * before))
 
 
-def _seen_in(rays: RayCloud, camera: RectifiedCamera) -> _Seen:
+def _seen_in(
+    rays: RayCloud, camera: RectifiedCamera
+) -> tuple[Float64, Float64, Float64, Float64, float]:
+    """Return what is in squares of an image (S,), and the standard deviation of inverse depths.
+
+    Largest and smallest inverse depth, 1/m (−inf and inf where nothing is); the largest of what may
+    hide it, in those around it and the next ones to both sides; and the texture around it.
+    """
     xyz, shape = rays.cloud().xyz.astype(np.float64), rays.texture.shape
     rows, cell = _squares(xyz, camera, shape)
     inverse = 1 / xyz[rows, 2]
@@ -134,8 +117,8 @@ def _seen_in(rays: RayCloud, camera: RectifiedCamera) -> _Seen:
     beside = np.maximum(_last(image), _last(image[:, ::-1])[:, ::-1])
     before = np.maximum(cv2.dilate(image, _AROUND), beside)
     sigma = float(np.median(rays.sigma_m[rows] * inverse**2)) if len(rows) else 0.0
-    texture = cv2.dilate(rays.texture, _AROUND).ravel().astype(np.float64)
-    return _Seen(near, far, before.ravel(), sigma, texture)
+    texture = cv2.dilate(rays.texture, _AROUND).astype(np.float64)
+    return near, far, before.ravel(), texture.ravel(), sigma
 
 
 def _squares(xyz: Float64, camera: RectifiedCamera, shape: tuple[int, ...]) -> tuple[Int64, Int64]:
