@@ -9,6 +9,8 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.drive_options import open_workers
+from recon.core.errors import SettingsError
+from recon.core.text import parse_number
 
 Resolution = Annotated[
     float | None,
@@ -17,8 +19,12 @@ Resolution = Annotated[
 
 
 def _bands(text: str) -> dict[str, list[list[float]]]:
-    numbers = (opt.parse_numbers(band.replace(":", ","), "--heights") for band in text.split(","))
-    return {"grid.heights_m": [[*band] for band in numbers if band is not None]}
+    try:
+        bands = [[parse_number(end) for end in one.split(":")] for one in text.split(",")]
+    except ValueError as error:
+        what, expected = "not bands of heights", "0.1:0.5,0.5:2"
+        raise SettingsError(what, where="--heights", got=text, expected=expected) from error
+    return {"grid.heights_m": bands}
 
 
 Heights = Annotated[
