@@ -205,6 +205,16 @@ TABLES: Final[dict[str, Table]] = {
         | {"SSIM, vertices": SHARE, "SSIM, texture": SHARE},
         lambda found: found,
     ),
+    "esdf": Table(
+        {
+            f"rendered street, seed {seed}": f"python benchmarks/esdf.py --seed {seed} --json"
+            for seed in (0, 1)
+        },
+        {"places": "{:,}", "off": "{:.2f} m", "off, 95 %": "{:.2f} m", "nearer": "{:.2f} m"}
+        | {"too far": "{:.1f} %", "seconds": "{:.1f}", "memory": "{:.0f} MB"},
+        lambda found: found,
+        timed=True,
+    ),
     "survey": Table(
         {
             "kitti_raw_0013": "python benchmarks/survey.py $RECON_DATA/driven/kitti_raw_0013 "

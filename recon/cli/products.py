@@ -9,10 +9,31 @@ import typer
 
 from recon.cli import options as opt
 from recon.cli.drive_options import open_workers
+from recon.core.errors import SettingsError
+from recon.core.text import parse_number
 
 Resolution = Annotated[
     float | None,
     opt.setting("occupancy.resolution_m", "Cell size in metres.", default="as in the run"),
+]
+
+
+def _bands(text: str) -> dict[str, list[list[float]]]:
+    try:
+        bands = [[parse_number(end) for end in one.split(":")] for one in text.split(",")]
+    except ValueError as error:
+        what, expected = "not bands of heights", "0.1:0.5,0.5:2"
+        raise SettingsError(what, where="--heights", got=text, expected=expected) from error
+    return {"grid.heights_m": bands}
+
+
+Heights = Annotated[
+    str | None,
+    opt.setting(
+        _bands,
+        "Grids of other bands of heights besides, such as 0.1:0.5,0.5:2 (metres above ground).",
+        metavar="LOW:HIGH,…",
+    ),
 ]
 
 
@@ -22,15 +43,17 @@ def export(
     to: Annotated[
         list[str] | None,
         opt.option(
-            "cloud, grid, octomap, mesh; costmap (Nav2); for surveying programs las, laz, "
-            "copc, e57, and dsm, dtm, slope, orthophoto, grid-geotiff (GeoTIFF); pcd (PCL), npz "
-            "(NumPy), mcap, gridmap (ROS 2), colmap, nerfstudio, texture; several with commas.",
+            "cloud, grid, octomap, mesh; costmap (Nav2), esdf (distances, NumPy); for surveying "
+            "programs las, laz, copc, e57, and dsm, dtm, slope, orthophoto, grid-geotiff "
+            "(GeoTIFF); pcd (PCL), npz (NumPy), mcap, gridmap (ROS 2), colmap, nerfstudio, "
+            "texture; several with commas.",
             default="the first four",
         ),
     ] = None,
     out: opt.Out = None,
     formats: opt.Formats = None,
     resolution: Resolution = None,
+    heights: Heights = None,
     georeference: Annotated[
         Path | None,
         opt.option(
@@ -60,7 +83,8 @@ def export(
 
     Examples:
       recon export outputs/map/latest --to grid,mesh --format glb --out robot
-      recon export outputs/map/latest --to grid --set grid.max_height_m=3.2
+      recon export outputs/map/latest --to grid --heights 0.1:0.5,0.5:2
+      recon export outputs/map/latest --to esdf --resolution 0.1
       recon export outputs/map/latest --to mesh --set mesh.depth=9
       recon export outputs/site --to laz --georeference gnss.txt --crs EPSG:25832
       recon export outputs/site --to dsm,orthophoto --resolution 0.1
@@ -140,6 +164,7 @@ def occupancy(
     max_height: Annotated[
         float | None, opt.setting("grid.max_height_m", "Upper end of the band, in metres.")
     ] = None,
+    heights: Heights = None,
     max_range: Annotated[
         float | None,
         opt.setting("occupancy.max_range_m", "Ignore obstacles farther than this, in metres."),

@@ -32,7 +32,13 @@ from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
 from recon.export.mesh.texture import texture_product
 from recon.export.nerfstudio import nerfstudio_product
-from recon.export.occupancy import Flattening, GridFigures, grid_product, octomap_product
+from recon.export.occupancy import (
+    Flattening,
+    GridFigures,
+    esdf_product,
+    grid_product,
+    octomap_product,
+)
 from recon.export.product import ExportContext, ExportResult, Product, ProductFigures
 from recon.export.rasters import RASTERS, raster_product, stem_of
 from recon.io.atomic import check_targets, writing_to
@@ -46,6 +52,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "cloud": Product("map/cloud.ply", cloud_product),
     "octomap": Product("map/octomap.bt", octomap_product, (".ot",), needs_occupancy=True),
     "grid": Product("map/grid.yaml", grid_product, parts=(".pgm", ".wld"), needs_occupancy=True),
+    "esdf": Product("map/esdf.npz", esdf_product, needs_occupancy=True),
     "costmap": Product(
         "map/costmap.yaml", costmap_product, parts=(".png", ".wld"), needs_occupancy=True
     ),

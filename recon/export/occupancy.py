@@ -1,4 +1,4 @@
-"""The occupancy of a map as files: an OctoMap in 3-D, a flat grid for navigation."""
+"""The occupancy of a map as files: OctoMap and distances in 3-D, a flat grid for navigation."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +19,12 @@ from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64, Int32
 from recon.core.values.grid import log_odds
 from recon.export.product import ExportContext, ExportResult, ProductFigures
+from recon.io.models.columns import write_npz
 from recon.io.models.octomap import write_octomap_tiles
 from recon.io.models.rasters import write_nav2
 from recon.map.builders import MIN_PROBABILITY
 from recon.map.cut import Rectangle, TileKey
+from recon.map.esdf import DistanceField
 from recon.map.ground.axes import base_axes
 from recon.map.ground.grid import (
     DrivenPath,
@@ -80,10 +82,28 @@ class OctomapFigures(ProductFigures):
     voxels: int
 
 
+@dataclass(frozen=True)
+class EsdfFigures(ProductFigures):
+    """The voxels that have a signed distance, and where distances end."""
+
+    esdf_occupied: int
+    esdf_free: int
+    max_distance_m: float
+
+
 def grid_product(context: ExportContext, path: Path) -> ExportResult:
-    """Write the flat grid as Nav2 reads it, given the path of its YAML file."""
+    """Write the flat grid as Nav2 reads it, given the path of its YAML file.
+
+    Those of other bands of heights lie beside it, such as ``grid_0.5-2m.yaml``.
+    """
+    settings, stem = context.placed.tiles.config.grid, path.with_suffix("")
     grid, height_m, warnings = Flattening(context.placed).grid()
-    write_nav2(path.with_suffix(""), grid)
+    write_nav2(stem, grid)
+    for low_m, high_m in settings.heights_m:
+        band = settings.model_copy(update={"min_height_m": low_m, "max_height_m": high_m})
+        other, _, more = Flattening(context.placed, band).grid()
+        write_nav2(f"{stem}_{low_m:g}-{high_m:g}m", other)
+        warnings += more
     rows, columns = grid.cells.shape
     figures = GridFigures(
         resolution_m=grid.resolution_m,
@@ -281,3 +301,34 @@ def octomap_product(context: ExportContext, path: Path) -> ExportResult:
     except MappingError as error:
         warnings.append(f"no OctoMap: {error}")
     return ExportResult(OctomapFigures(sum(len(tile.voxels) for tile in tiles)), warnings)
+
+
+def esdf_product(context: ExportContext, path: Path) -> ExportResult:
+    """Write an archive of NumPy: the signed distance of the centre of each known voxel.
+
+    What its arrays are: `docs/formats.md`. Memory holds a tile and its margin.
+    """
+    field, tiles = DistanceField(context.placed.tiles), context.placed.tiles
+    heights = (tile.voxels.keys[:, 2] for tile in tiles)
+    bottoms, tops = zip(*((z.min(), z.max() + 1) for z in heights if len(z)), strict=True)
+    low = np.array([*tiles.extent[0], min(bottoms)], np.int32)
+    high = np.array([*tiles.extent[1], max(tops)])
+    counts = np.zeros(2, np.int64)
+
+    def parts() -> Iterator[dict[str, NDArray[Any]]]:
+        for tile in tiles:
+            keys, distance_m = field.of_tile(tile.key)
+            counts[:] += (distance_m < 0).sum(), (distance_m > 0).sum()
+            state = np.where(distance_m < 0, OCCUPIED, FREE).astype(np.int8)
+            yield {"cells": keys - low, "distance_m": distance_m, "state": state}
+            tiles.config.memory.check("measuring distances")
+
+    whole = {
+        "shape": high - low,
+        "origin_m": low * tiles.resolution_m,
+        "resolution_m": np.float64(tiles.resolution_m),
+        "max_distance_m": np.float64(field.max_distance_m),
+    }
+    write_npz(path, parts(), {name: np.asarray(one) for name, one in whole.items()})
+    occupied, free = counts.tolist()
+    return ExportResult(EsdfFigures(occupied, free, field.max_distance_m))

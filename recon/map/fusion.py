@@ -36,7 +36,8 @@ class FusionSettings(Settings):
     remove_moving: bool = True
     """Leave points of things that moved out of the cloud and the mesh: what was there as a whole at
     one time and gone at another, by the rays of single frames (occupancy.keep_rays). They are
-    written to map/removed.ply."""
+    written to map/removed.ply. What left before a plain wall, which no ray reaches, is taken out of
+    occupancy and grid, too."""
 
 
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:

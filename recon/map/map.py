@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,11 +20,12 @@ from recon.core.values import (
     StereoPair,
 )
 from recon.core.values.arrays import Float32, Float64, Int8, Int64, freeze
+from recon.map.esdf import DistanceField
 from recon.map.ground.grid import drop_undecided
 from recon.map.localize.localizer import Localizer, Located
 from recon.map.sessions.copying import copy_sessions
 from recon.map.sessions.joining import join_new
-from recon.map.sessions.placed import place_map, settings_of
+from recon.map.sessions.placed import check_rays, has_occupancy, place_map, settings_of
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile, known_places
 from recon.map.store.session import Session
@@ -36,6 +38,7 @@ class Map(MapFile):
     """One or several drives on disk, to be merged, cut or searched; `MapFile` has what is in it."""
 
     _cut: tuple[object, Tiles] | None = None
+    _field: DistanceField | None = None
 
     def merge(self, other: Map) -> list[Session]:
         """Add the drives of another finished map, and place those that saw the same places.
@@ -74,10 +77,43 @@ class Map(MapFile):
             ShapeError: They are no such numbers, or not finite.
             FormatError: The map is damaged, or has no drive.
         """
+        return look_up(self._kept_tiles(), xyz)
+
+    @overload
+    def distance(self, xyz: ArrayLike) -> Float64: ...
+    @overload
+    def distance(self, xyz: ArrayLike, *, gradient: Literal[True]) -> tuple[Float64, Float64]: ...
+    def distance(
+        self, xyz: ArrayLike, *, gradient: bool = False
+    ) -> Float64 | tuple[Float64, Float64]:
+        """Return how far places (3,) or (N, 3), map axes, are from the nearest occupied voxel.
+
+        float64 (N,), metres to its cube, negative in occupied voxels (to the nearest free one).
+        NaN = unknown space, which may hide what is nearer. Distances end at 5 m, times the scale of
+        the scene: so much means that or more. With ``gradient`` also theirs, float64 (N, 3): of
+        length 1, away from the obstacle; 0 where distances end, NaN where unknown. The first call
+        cuts the map, as that of `at` does.
+
+        Raises:
+            ShapeError: They are no such numbers, or not finite.
+            FormatError: The map is damaged, has no drive, or kept no rays.
+            MappingError: Nothing was observed.
+        """
+        places = _checked(xyz)
+        if not has_occupancy(self):
+            check_rays(self.first, settings_of(self.first))
+        tiles = self._kept_tiles()
+        if self._field is None or self._field.tiles is not tiles:
+            self._field = DistanceField(tiles)
+        found = self._field.at(places)
+        return found if gradient else found[0]
+
+    def _kept_tiles(self) -> Tiles:
+        """Return the tiles of the drives as they are linked now."""
         state = [(session.number, len(session)) for session in self.linked], len(self.links)
         if self._cut is None or self._cut[0] != state:
             self._cut = state, self.tiles()
-        return look_up(self._cut[1], xyz)
+        return self._cut[1]
 
     def localize(
         self,

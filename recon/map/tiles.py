@@ -7,7 +7,7 @@ fused and filtered when it is first asked for, and then kept for all products.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from heapq import merge
 from itertools import groupby, product
@@ -29,6 +29,7 @@ from recon.map.fusion import ALL, FusedPart, join_fused
 from recon.map.ground.surface import find_floors
 from recon.map.kernels.raycast import BLOCK_BITS
 from recon.map.occupancy.bodies import FrameObservations
+from recon.map.occupancy.gone import GONE, find_gone
 from recon.map.occupancy.moving import CellEvidence, cell_evidence, find_moved
 from recon.map.occupancy.part import OccupancyPart, join_occupancy
 from recon.map.settings import DriveSettings
@@ -179,6 +180,9 @@ class Tiles:
         if self._parts.numbers(OCCUPANCY, key) and not self._parts.numbers(_VOXELS, key):
             joined = self._chain.joined(key, note=self.config.fusion.remove_moving)
             voxels = joined.voxels(self.resolution_m)
+            if self.config.fusion.remove_moving and self.observations is not None and len(voxels):
+                gone = find_gone(voxels, self.observations.views(voxels.centres_m))
+                voxels = replace(voxels, log_odds=np.where(gone, GONE, voxels.log_odds))
             self._parts.put(_VOXELS, key, {"keys": voxels.keys, "log_odds": voxels.log_odds})
             self.config.memory.check("putting the occupancy together")
         found = self._parts.read(_VOXELS, key)
@@ -309,7 +313,10 @@ class DriveChain:
         # Whether a surface crosses a voxel depends on what hit the blocks that touch its own.
         changed, needed = _grown(blocks, 1), _grown(blocks, 2)
         joined = _outdone(part for _, part in self._drives(key, after, needed))
-        anew = joined.voxels(seen.resolution_m, changed)
+        anew, packed = joined.voxels(seen.resolution_m, changed), pack_keys(seen.keys)
+        gone = are_among(pack_keys(anew.keys), packed[seen.log_odds == GONE])
+        most = np.where(gone, GONE, np.float32(np.inf))
+        anew = replace(anew, log_odds=np.minimum(anew.log_odds, most))
         kept = seen.select(~are_among(pack_keys(seen.keys >> BLOCK_BITS), changed))
         return join_voxels([kept, anew], seen.resolution_m)
 

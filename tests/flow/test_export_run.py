@@ -218,6 +218,11 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     ("cloud,gird", "--to: unknown product (got gird, expected cloud, octomap, grid"),
     ("mesh --format step", "unknown mesh format (got step"),
     ("grid --set fusion.min_count=1", "no effect here"),
+    ("grid --heights 0.1-2", "--heights: not bands of heights (got 0.1-2, expected 0.1:0.5,"),
+    ("grid --heights 0.1:0.5:2", "grid.heights_m"),
+    ("grid --heights 0.1:", "not bands of heights"),
+    ("grid --heights nan:1", "grid.heights_m"),
+    ("grid --heights 2:0.5", "height band of the grid is empty (got 2 to 0.5 m)"),
     ("mesh --workers 2", "only grids and OctoMaps"),
 ])  # fmt: skip
 def test_what_cannot_be_asked_for_is_one_line(small_demo, tmp_path, options, said):
@@ -335,6 +340,24 @@ def test_another_height_band_changes_the_grid_alone(small_demo, tmp_path):
     assert low.cells.shape == high.cells.shape
     parked = (low.cells == OCCUPIED) & (high.cells != OCCUPIED)
     assert parked.sum() > 10  # cars are lower than the band
+
+
+def test_bands_of_heights_have_grids_of_their_own_from_one_command(small_demo, tmp_path):
+    out = tmp_path / "bands"
+    words = ("--to", "grid", "--heights", "0.3:0.8,2.2:6", "--out", out, "--json")
+    assert run("export", small_demo, *words).code == 0
+    assert_equal(out, small_demo, "map/grid.yaml", "map/grid.pgm")
+    for low, high in (("0.3", "0.8"), ("2.2", "6")):
+        _remake(small_demo, tmp_path / low, f"grid.min_height_m={low}", f"grid.max_height_m={high}")
+        alone = read_grid(tmp_path / low / "map/grid.yaml")
+        band = read_grid(out / f"map/grid_{low}-{high}m.yaml")
+        np.testing.assert_array_equal(band.cells, alone.cells)
+        assert (band.resolution_m, band.origin_m) == (alone.resolution_m, alone.origin_m)
+    record = json.loads((out / "run.json").read_text())
+    assert "map/grid_2.2-6m.wld" in record["files"]
+    # The settings of the run say it, too.
+    kept = run_settings(out)
+    assert kept.grid.heights_m == ((0.3, 0.8), (2.2, 6.0))
 
 
 # Few small images: what was measured is 0.96 and 0.53, 0.91 and 0.96. At 0.1 m neighbouring rays

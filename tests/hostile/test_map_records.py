@@ -58,7 +58,9 @@ def _add_drive(map_: Map) -> None:
     lens = replace(raw.left, distortion=np.full(5, 0.01))
     session.set_rig(RefinedRig(camera, replace(raw, left=lens, right=lens), camera, fitted))
     grain, ones = ray_grain(OccupancySettings()), np.ones(4, np.uint8)
-    rays = RayCloud(np.ones((4, 3), np.int16), ones.astype(np.float16), ones, ones, grain.unit_m)
+    texture = np.ones((2, 3), np.uint8)
+    kept = ones.astype(np.float16), ones, ones, grain.unit_m, texture
+    rays = RayCloud(np.ones((4, 3), np.int16), *kept)
     for frame in range(FRAMES):
         session.add_frame(np.eye(4), float(frame), OdometryHealth(notes=("note",)))
         session.add_rays(frame, rays, grain)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -255,8 +255,11 @@ class RayCloud:
     confidence: UInt8  # (N,), 255 = certain
     count: UInt8  # (N,), number of averaged points; 255 = 255 or more
     unit_m: float  # quantisation step of ``places``
+    #: uint8, mean gradient of the image in squares, 255 = not known; empty = of none
+    texture: UInt8 = field(default_factory=lambda: np.zeros((0, 0), np.uint8))
 
     def __post_init__(self) -> None:
+        freeze(self, "texture", np.uint8, (None, None))
         freeze(self, "places", np.int16, (None, 3))
         freeze(self, "sigma_m", np.float16, (len(self.places),))
         freeze(self, "confidence", np.uint8, (len(self.places),))

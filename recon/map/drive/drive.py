@@ -29,6 +29,7 @@ from recon.map.drive.drive_loops import DriveLoops, LoopWatch
 from recon.map.drive.mapper import FrameResult, Mapper
 from recon.map.listener import NOBODY, DriveBegun, DriveListener, PoseTeller
 from recon.map.map import Map
+from recon.map.occupancy.gone import texture_of
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
 from recon.odometry.health import segment_numbers
@@ -129,7 +130,9 @@ class Drive:
 
     def _with_rays(self, frame: ReconstructedFrame) -> ReconstructedFrame:
         with self._stage("thin"):
-            return replace(frame, rays=thin_rays(frame.cloud, self.config.occupancy))
+            rays = thin_rays(frame.cloud, self.config.occupancy)
+            texture = texture_of(frame.pair.left, frame.pair.valid)
+            return replace(frame, rays=replace(rays, texture=texture))
 
     def _add(self, frame: ReconstructedFrame, found: OdometryResult) -> FrameResult:
         result = self.mapper.add(frame, found, total=self._total)

@@ -9,7 +9,7 @@ is seen on a later visit.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import cv2
 import numpy as np
@@ -40,6 +40,11 @@ FREE_PROBABILITY: Final = 0.35  # voxels at most this probable are free
 MIN_BLOB_CELLS: Final = 3  # fewer connected blocked cells are taken for noise
 
 
+_Height = Annotated[float, Field(ge=0.0, le=100.0)]
+Band = tuple[_Height, _Height]
+"""Lower and upper end of a band of heights."""
+
+
 class GridSettings(Settings):
     """How voxels are flattened. Heights are of centres of voxels, above the local ground."""
 
@@ -48,6 +53,9 @@ class GridSettings(Settings):
     max_height_m: float = Field(2.0, ge=0.01, le=100.0)
     """Upper end of the band: what is higher is passed under. The height of the vehicle, or of the
     robot that a costmap is for."""
+    heights_m: tuple[Band, ...] = ()
+    """Other bands, for robots or drones of other heights: each has a grid of its own beside that
+    of the band above, such as [[0.1,0.5],[0.5,2]]."""
     vehicle_width_m: float = Field(0.6, ge=0.0, le=10.0)
     """Width of what carried the camera: cells that it passed over are free; 0 = only what was seen
     is free."""

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from recon.core.geometry.se3 import apply, invert
 from recon.core.kernels.voxels import find_keys, pack_keys, unpack_keys
-from recon.core.values import PointCloud, RayCloud
+from recon.core.values import PointCloud, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, Int8, Int64
 from recon.map.builders import RAYS_PER_VOXEL, SPREAD_SIGMAS, OccupancySettings, frame_rays
 from recon.map.kernels.observations import count_observation, rays_towards
@@ -37,6 +37,7 @@ from recon.map.kernels.raycast import (
     blocks_of,
     cast_rays_into,
 )
+from recon.map.occupancy.gone import FrameView
 
 _DISAGREEMENT: Final = 0.4
 """Largest disagreement within a body, root mean square of that of all and of upright pairs.
@@ -131,7 +132,7 @@ class FrameObservations:
     """The frames of all drives of a map, in order, taken at ``T_map_camera`` (F, 4, 4).
 
     ``rays`` gives the kept rays of a frame by its number here, ``settings`` how they become
-    occupancy; ``frames`` are drive and frame of each, where they are asked for.
+    occupancy; ``frames`` are drive and frame of each, ``cameras`` theirs, where they are asked for.
     """
 
     def __init__(
@@ -140,8 +141,10 @@ class FrameObservations:
         T_map_camera: Float64,
         rays: Callable[[int], RayCloud],
         frames: Sequence[tuple[int, int]] = (),
+        cameras: Sequence[RectifiedCamera] = (),
     ) -> None:
         self.settings, self.T_map_camera, self.frames = settings, T_map_camera, frames
+        self._cameras = cameras
         self._read = lru_cache(_KEPT_FRAMES)(rays)
 
     def at(self, keys: Int64) -> Iterator[Int8]:
@@ -190,6 +193,12 @@ class FrameObservations:
         """Yield the rays of frames near a rectangle, camera axes, and ``T_map_camera`` of each."""
         for frame in self._near(low, high, self.settings.max_range_m):
             yield self._read(int(frame)).cloud(), self.T_map_camera[frame]
+
+    def views(self, places_m: Float64) -> Iterator[FrameView]:
+        """Yield the views of frames near places (N, 3), in order; none if cameras are unknown."""
+        ends = places_m.min(axis=0), places_m.max(axis=0)
+        for frame in self._near(*ends, self.settings.max_range_m) if self._cameras else ():
+            yield self._read(int(frame)), self.T_map_camera[frame], self._cameras[frame]
 
     def _near(self, low: Float64, high: Float64, reach_m: float) -> Int64:
         """Return the frames from which something between two corners may be in reach."""

@@ -48,6 +48,7 @@ from recon.map.occupancy.bodies import (
     still_there,
     strides,
 )
+from recon.map.occupancy.gone import GONE
 from recon.map.occupancy.part import OccupancyPart
 
 _FREE: Final = np.float32(log_odds(0.35))
@@ -127,7 +128,7 @@ def find_moved(
                 break
         lowest = np.flatnonzero(free_itself & ~moved)
         moved[lowest] = _touching(keys[lowest], keys[moved], _ABOVE) > 0
-    moved = moved[home]
+    moved = moved[home] | are_among(packed, pack_keys(voxels.keys[voxels.log_odds == GONE]))
     occupied = np.sort(occupied[~are_among(occupied, packed[moved & placed])])
     unsure = np.flatnonzero(moved & ~placed)
     reach = FREE_MARGIN_SIGMAS * sigma_m[unsure] / voxels.resolution_m

@@ -223,7 +223,8 @@ def _observations(map_: MapFile, settings: DriveSettings) -> FrameObservations |
         return session.rays(frame)[0]
 
     names = [(session.number, frame) for session, frame in seen]
-    return FrameObservations(settings.occupancy, np.concatenate(poses), rays, names)
+    cameras = [session.camera for session, _ in seen]
+    return FrameObservations(settings.occupancy, np.concatenate(poses), rays, names, cameras)
 
 
 def _no_evidence(map_: MapFile, session: Session) -> frozenset[int]:

@@ -244,6 +244,7 @@ def rays_record(rays: RayCloud, grain: RayGrain) -> dict[str, Any]:
         "sigma_m": rays.sigma_m,
         "confidence": rays.confidence,
         "count": rays.count,
+        "texture": rays.texture,
         "grain": asdict(grain),
     }
 
@@ -260,6 +261,8 @@ def rays_in(content: Mapping[str, Any]) -> tuple[RayCloud, RayGrain]:
     if array_in(content, "sigma_m", np.float16, (len(places),)).min(initial=0.0) < 0:
         raise FormatError("a ray of the map has a negative deviation")
     parts = {name: content[name] for name in ("sigma_m", "confidence", "count")}
+    if "texture" in content:  # older maps have none
+        parts["texture"] = array_in(content, "texture", np.uint8, (None, None))
     return value_in(RayCloud, {"places": places, **parts, "unit_m": grain.unit_m}), grain
 
 
