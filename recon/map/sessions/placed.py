@@ -141,7 +141,7 @@ class PlacedSubmaps:
         for session in [] if self.ready else sessions:
             check_rays(session, settings)
         self._settings = settings
-        self._entries = sessions[0].submaps.entries
+        self._entries = sessions[0].submaps.entries if alone else ()
         self._apart = [_without_place(map_, session) for session in sessions]
         self.drives = [len(session.submaps) for session in sessions]
         self.corrections = sessions[0].corrections() if alone else None
