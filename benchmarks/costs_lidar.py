@@ -82,10 +82,11 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def measured(options: argparse.Namespace) -> dict[str, Any]:
     """Map the drive and make its costmap, as docs/walk-robot.md does."""
     with tempfile.TemporaryDirectory() as folder:
-        out = MapOptions(out=Path(folder) / "run", mesh=False, audit=False)
-        run_map(open_source(options.drive), load_config(None, options.set), out)
-        config = load_config(out.out / "config.yaml", ROBOT)
-        with Map.open(out.out) as map_:
+        run = Path(folder) / "run"
+        how = MapOptions(out=run, mesh=False, audit=False)
+        run_map(open_source(options.drive), load_config(None, options.set), how)
+        config = load_config(run / "config.yaml", ROBOT)
+        with Map.open(run) as map_:
             placed = place_map(map_, config)
             with patch("recon.export.costmap.widened", lambda grid, *_: grid):
                 ground, _ = make_costmap(map_, placed)
@@ -157,13 +158,15 @@ def plane(z: Float64, used: Bool, reach: int, cell_m: float) -> tuple[Float64, F
     known = np.where(used, z, 0.0)
 
     def summed(values: Float64, kernel: Float64) -> Float64:
-        return cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT)
+        found = cv2.filter2D(values, cv2.CV_64F, kernel, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(found, np.float64)
 
     right = np.stack([summed(known, one) for one in basis], axis=-1)
     normal = np.stack([summed(weight, a * b) for a, b in product(basis, repeat=2)], axis=-1)
     normal = normal.reshape(*z.shape, 3, 3)
     count = normal[..., 0, 0].copy()
-    return np.linalg.solve(normal + 1e-6 * np.eye(3), right[..., None])[..., 0], count
+    beta = np.linalg.solve(normal + 1e-6 * np.eye(3), right[..., None])[..., 0]
+    return np.asarray(beta, np.float64), np.asarray(count, np.float64)
 
 
 def on_a_road(height_m: Float64, ground: Bool, cell_m: float) -> Bool:
@@ -176,7 +179,7 @@ def on_a_road(height_m: Float64, ground: Bool, cell_m: float) -> Bool:
             sides[2 * (r > 0) + (c > 0)] += off_m < FLAT_M
     width = 2 * ALONE + 1
     enough = count >= width**2 / 4
-    return enough & (total >= 0.6 * width**2) & (sides.min(axis=0) >= 4)
+    return np.asarray(enough & (total >= 0.6 * width**2) & (sides.min(axis=0) >= 4))
 
 
 def off_plane(
