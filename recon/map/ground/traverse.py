@@ -104,7 +104,7 @@ def measure_relief(
     height_m, ratio = z / weight, squares / weight**2
     # The error of one frame: as its points say, or as frames differ, which is what they have not in
     # common. Of the mean of many, what they have in common stays.
-    differ = (1 - _CORRELATION) * np.maximum(1 - ratio, 0.1)  # one that weighs most differs little
+    differ = (1 - _CORRELATION) * np.maximum(1 - ratio, 0.1)  # hidden if one outweighs all
     scatter = np.maximum(zz / weight - height_m**2, 0.0) / differ
     stays = _CORRELATION + (1 - _CORRELATION) * ratio
     sigma_m = np.sqrt(np.maximum(variance / weight, scatter) * stays + _LEAST_SIGMA_M**2)
@@ -167,7 +167,7 @@ class _Fit:
         self._height_m = np.nan_to_num(relief.height_m - middle_m)
 
     def slopes(self, limit: float) -> Judged:
-        beta, covariance = self._solve(np.ones_like(self._x))
+        beta, covariance, _ = self._solve(np.ones_like(self._x))
         slope = np.linalg.norm(beta[..., 1:3], axis=-1)
         sigma = np.sqrt(covariance[..., [1, 2], [1, 2]].max(axis=-1))
         return self._judged(slope, sigma, slope, sigma, limit)
@@ -179,7 +179,7 @@ class _Fit:
             side_m = direction[0] * self._x + direction[1] * self._y
             # The cells in between may lie on both sides.
             used = (np.abs(side_m) > 0.6 * self._cell_m).astype(np.float64)
-            beta, covariance = self._solve(used, 0.5 * used * np.sign(side_m))
+            beta, covariance, doubt = self._solve(used, 0.5 * used * np.sign(side_m))
             products = direction[[0, 0, 1]] * direction[[0, 1, 1]] * [1, 2, 1]
             blur_m = np.sqrt(np.einsum("k...,k", self._blur_m2, products))
             # A step, and with what rises along it: errors of both are opposite, and mostly cancel.
@@ -189,19 +189,24 @@ class _Fit:
             most_m = np.abs(np.einsum("...i,...i", risen, beta[..., 1:]))
             spread = np.einsum("...i,...ij,...j", risen, covariance[..., 1:, 1:], risen)
             step_m, sigma_m = np.abs(beta[..., 3]), np.sqrt(covariance[..., 3, 3])
-            yield self._judged(step_m, sigma_m, step_m, sigma_m, limit_m)
-            yield self._judged(step_m, sigma_m, most_m, np.sqrt(spread), limit_m)
+            yield self._judged(step_m, doubt * sigma_m, step_m, sigma_m, limit_m)
+            yield self._judged(step_m, doubt * sigma_m, most_m, np.sqrt(spread), limit_m)
         inner = max(1, self._reach // 2) + 0.5
         bump = np.maximum(np.abs(self._x), np.abs(self._y)) < inner * self._cell_m
-        beta, covariance = self._solve(np.ones_like(self._x), bump)
+        beta, covariance, doubt = self._solve(np.ones_like(self._x), bump)
         bump_m, sigma_m = np.abs(beta[..., 3]), np.sqrt(covariance[..., 3, 3])
         # What is blurred over more than its own size is lower by as much.
         blur_m2 = self._blur_m2[0] + self._blur_m2[2]
         fades = np.sqrt(1 + blur_m2 / (2 * inner * self._cell_m) ** 2)
-        yield self._judged(bump_m, sigma_m, bump_m * fades, sigma_m * fades, limit_m)
+        yield self._judged(bump_m, doubt * sigma_m, bump_m * fades, sigma_m * fades, limit_m)
 
-    def _solve(self, used: Float64, extra: Float64 | None = None) -> tuple[Float64, Float64]:
-        """Return height, slopes and perhaps the extra coefficient (..., 3 or 4); covariances."""
+    def _solve(
+        self, used: Float64, extra: Float64 | None = None
+    ) -> tuple[Float64, Float64, Float64]:
+        """Return height, slopes and perhaps the extra coefficient (..., 3 or 4), and covariances.
+
+        Also by how much more deviations are if what is stated of heights is believed (at least 1).
+        """
         basis = [used, used * self._x, used * self._y] + ([] if extra is None else [extra])
         w, z, n = self._weight, self._height_m, len(basis)
         normal, right = np.empty((*w.shape, n, n)), np.empty((*w.shape, n))
@@ -215,9 +220,11 @@ class _Fit:
         spare = np.maximum(_sum_around((w > 0).astype(np.float64), used) - n, 0.0)
         # How well it fits says what part of the errors differs within the window, which is all that
         # looks like a step; what is stated counts as one more cell.
-        scale = (self._alike**2 * (1 + left) / (1 + spare))[..., None, None]
-        covariance = np.linalg.inv(normal / scale + prior)
-        return np.einsum("...ij,...j", covariance, right / scale[..., 0]), covariance
+        fit = (1 + left) / (1 + spare)
+        scale = (self._alike**2 * fit)[..., None]
+        covariance = np.linalg.inv(normal / scale[..., None] + prior)
+        beta = np.einsum("...ij,...j", covariance, right / scale)
+        return beta, covariance, np.maximum(1.0, fit**-0.5)
 
     def _judged(
         self, value: Float64, sigma: Float64, most: Float64, most_sigma: Float64, limit: float
