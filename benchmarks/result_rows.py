@@ -113,21 +113,36 @@ def occupancy(found: Found) -> Rows:
 
 
 def traversability(found: Found) -> Rows:
-    """Free / obstacle / unknown in percent, by kind and distance."""
+    """Free / graded / obstacle / unknown in percent, by kind and distance."""
     rows: Rows = {}
     for vehicle, one in found["courses"].items():
         rows[vehicle] = {
             "over, free": one["over the limit, free within 12 m"],
+            "over, to 50": one["over the limit, cost to 50 within 12 m"],
+            "over, above 50": one["over the limit, cost above 50 within 12 m"],
             "ramps, obstacle": one["ramps up to 15 %, obstacle"],
         }
         for kind, bands in one["cells"].items():
-            rows[f"{vehicle}, {kind}"] = {band: thirds(cells) for band, cells in bands.items()}
+            rows[f"{vehicle}, {kind}"] = {band: quarters(cells) for band, cells in bands.items()}
     return rows
 
 
-def thirds(cells: dict[str, int]) -> str | None:
-    counted = [cells.get(state, 0) for state in ("free", "obstacle", "unknown")]
+def quarters(cells: dict[str, int]) -> str | None:
+    graded = cells.get("low", 0) + cells.get("high", 0)
+    counted = [cells.get("free", 0), graded, cells.get("obstacle", 0), cells.get("unknown", 0)]
     return " / ".join(f"{100 * n / sum(counted):.0f}" for n in counted) if any(counted) else None
+
+
+def costs_lidar(found: Found) -> Rows:
+    """Cells of each kind, by what LiDAR says of them."""
+    rows: Rows = {}
+    for drive, parts in found.items():
+        for part, kinds in parts.items():
+            for kind, cells in kinds.items():
+                total = sum(cells.values())
+                usable = 100 * (cells["free"] + cells["graded"]) / total
+                rows[f"{drive}, {kind}, {part}"] = {"cells": total, "0 to 99": usable, **cells}
+    return rows
 
 
 def loops(found: Found) -> Rows:

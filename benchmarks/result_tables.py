@@ -267,10 +267,19 @@ TABLES: Final[dict[str, Table]] = {
     "traversability": Table(
         {"courses": "python benchmarks/traversability.py --json"},
         dict.fromkeys(
-            ("0 to 4 m", "4 to 8 m", "8 to 12 m", "12 to 20 m", "over, free", "ramps, obstacle"),
-            "{}",
-        ),
+            ("0 to 4 m", "4 to 8 m", "8 to 12 m", "12 to 20 m", "over, free", "over, to 50"), "{}"
+        )
+        | dict.fromkeys(("over, above 50", "ramps, obstacle"), "{}"),
         rows_of.traversability,
+    ),
+    "costs-lidar": Table(
+        {
+            "kitti_raw_0013": f"python benchmarks/costs_lidar.py {D13} {D13}/lidar_map.ply "
+            f"{D13}/poses.txt --json"
+        },
+        {"cells": "{:,}", "0 to 99": "{:.1f} %"}
+        | dict.fromkeys(("free", "graded", "obstacle", "unsure", "unknown"), "{:,}"),
+        rows_of.costs_lidar,
     ),
     "loops": Table(
         {

@@ -2,8 +2,9 @@
 
 A course has ramps, kerbs, holes, ditches and boughs in three lanes ahead of a short drive, in an
 order and at distances that follow from the seed. Cells on them are counted by their distance from
-the last frame: free (with any cost below that of an obstacle), obstacle, or unknown. What is over
-the limit of the robot must not be free within 12 m, and no ramp up to 15 % an obstacle.
+the last frame: free (cost 0), graded (below that of an obstacle), obstacle, or unknown. What is
+over the limit of the robot must not be free within 12 m, nor have a cost up to 50, that of what is
+as probably below; and no ramp up to 15 % may be an obstacle.
 
 Example: python benchmarks/traversability.py --json --seeds 0 1
 """
@@ -23,7 +24,7 @@ import numpy as np
 
 from recon.commands.config import load_config
 from recon.core.geometry import se3
-from recon.core.values import OCCUPIED, OccupancyGrid
+from recon.core.values import FREE, OCCUPIED, OccupancyGrid
 from recon.core.values.arrays import Float64
 from recon.export.costmap import make_costmap
 from recon.map.drive.sequence import map_sequence
@@ -209,6 +210,8 @@ def measured(vehicle: Vehicle, options: argparse.Namespace) -> dict[str, Any]:
     return {
         "cells": {kind: counts[kind] for kind in KINDS},
         "over the limit, free within 12 m": total(counts, over, "free", bands()[:3]),
+        "over the limit, cost to 50 within 12 m": total(counts, over, "low", bands()[:3]),
+        "over the limit, cost above 50 within 12 m": total(counts, over, "high", bands()[:3]),
         "ramps up to 15 %, obstacle": total(counts, ramps, "obstacle", bands()),
     }
 
@@ -221,7 +224,13 @@ def states(costs: OccupancyGrid, xy: Float64) -> list[str]:
     """What the cells at places (N, 2) are."""
     column, row = np.floor((xy - costs.origin_m) / costs.resolution_m).astype(int).T
     values = costs.cells[row, column].tolist()
-    return ["unknown" if v < 0 else "obstacle" if v == OCCUPIED else "free" for v in values]
+    return [state(value) for value in values]
+
+
+def state(cost: int) -> str:
+    if cost < FREE or cost >= OCCUPIED:
+        return "unknown" if cost < FREE else "obstacle"
+    return "free" if cost == FREE else "low" if cost <= OCCUPIED // 2 else "high"
 
 
 def over_limit(step_m: float) -> list[str]:
@@ -234,17 +243,20 @@ def total(counts: Any, kinds: Sequence[str], state: str, names: Sequence[str]) -
 
 
 def table(found: dict[str, Any]) -> str:
-    lines = [f"{'free / obstacle / unknown':30s}" + "".join(f"{name:>18s}" for name in bands())]
+    lines = [
+        f"{'free / graded / obstacle / unknown':34s}" + "".join(f"{name:>18s}" for name in bands())
+    ]
     for vehicle, one in found.items():
         for kind, cells in one["cells"].items():
             texts = [ratios(cells[name]) for name in bands()]
-            lines.append(f"{vehicle + ', ' + kind:30s}" + "".join(f"{t:>18s}" for t in texts))
+            lines.append(f"{vehicle + ', ' + kind:34s}" + "".join(f"{t:>18s}" for t in texts))
         lines += [f"{vehicle}: {name}: {n}" for name, n in one.items() if name != "cells"]
     return "\n".join(lines)
 
 
 def ratios(cells: Counter[str]) -> str:
-    counted = [cells.get(state, 0) for state in ("free", "obstacle", "unknown")]
+    graded = cells.get("low", 0) + cells.get("high", 0)
+    counted = [cells.get("free", 0), graded, cells.get("obstacle", 0), cells.get("unknown", 0)]
     return " / ".join(f"{100 * n / sum(counted):.0f}" for n in counted) if sum(counted) else ""
 
 

@@ -85,7 +85,7 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
         cell, inside = raster.cells_of((passed[:, :2].astype(np.float64) + 0.5) * raster.cell_m)
         driven = np.zeros(raster.shape, np.bool_)
         driven.ravel()[cell[inside]] = True
-        return widened(costs(relief, steps, slopes, robot, grid), robot, driven)
+        return widened(*costs(relief, steps, slopes, robot, grid), robot, driven)
 
     grid, _, warnings = Flattening(placed, band, finish).grid()
     if 2 * steep > seen:
