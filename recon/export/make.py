@@ -43,7 +43,6 @@ from recon.export.product import ExportContext, ExportResult, Product, ProductFi
 from recon.export.rasters import RASTERS, raster_product, stem_of
 from recon.io.atomic import check_targets, writing_to
 from recon.io.models.mesh import MESH_SUFFIXES
-from recon.map.ground.axes import base_axes
 from recon.map.ground.surface import BIN_M
 from recon.map.sessions.placed import check_rays, has_occupancy
 
@@ -148,16 +147,13 @@ def make(
 
 
 def _written(context: ExportContext, name: str, path: Path) -> ExportResult:
-    first, doubts = context.map.first, []
+    doubts: list[str] = []
     if PRODUCTS[name].needs_occupancy:
         if not has_occupancy(context.map):
-            check_rays(first, context.placed.tiles.config)
+            check_rays(context.map.first, context.placed.tiles.config)
         doubts = _stand_on_mounts(context)
     path.parent.mkdir(parents=True, exist_ok=True)
     made = PRODUCTS[name].write(context, path)
-    if isinstance(figures := made.figures, GridFigures):
-        T_base_camera = base_axes(first.T_map_world, figures.camera_height_m, first.mount)
-        made = replace(made, figures=replace(figures, T_base_camera=T_base_camera))
     return replace(made, warnings=[*doubts, *made.warnings])
 
 

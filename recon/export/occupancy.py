@@ -97,6 +97,7 @@ def grid_product(context: ExportContext, path: Path) -> ExportResult:
     Those of other bands of heights lie beside it, such as ``grid_0.5-2m.yaml``.
     """
     settings, stem = context.placed.tiles.config.grid, path.with_suffix("")
+    first = context.map.first
     grid, height_m, warnings = Flattening(context.placed).grid()
     write_nav2(stem, grid)
     for low_m, high_m in settings.heights_m:
@@ -112,7 +113,7 @@ def grid_product(context: ExportContext, path: Path) -> ExportResult:
         occupied_cells=int((grid.cells == OCCUPIED).sum()),
         free_cells=int((grid.cells == FREE).sum()),
         camera_height_m=height_m,
-        T_base_camera=base_axes(context.map.first.T_map_world, height_m),
+        T_base_camera=base_axes(first.T_map_world, height_m, first.mount),
     )
     return ExportResult(figures, warnings, grid)
 
@@ -179,7 +180,7 @@ class Flattening:
             yield "no ground was found below the path, so every cell of the grid is unknown"
         elif not driven:
             text = "the camera was not carried at one height above the ground: the grid has only "
-            yield text + "what was seen, and the base of the trajectory in the map is the camera"
+            yield text + "what was seen, and where no robot states its base, the camera is the base"
         settings, cell_m = self._settings, self._resolution_m
         if driven and self._too_wide:
             yield (
