@@ -16,6 +16,7 @@ from recon.core.values import RectifiedCamera
 from recon.io.ros.dds import Network
 from recon.io.ros.messages import header, pose, transforms
 from recon.sources import ros2
+from recon.sources.live import LiveSource
 from recon.sources.ros2 import open_ros2
 from recon.sources.settings import SourceSettings
 from tests.scenery.ros2_player import image_message, imu_message, mount
@@ -160,6 +161,20 @@ def test_images_without_a_partner_are_left_out_and_counted():
         for pair in pairs_of(source, 8):
             assert int(pair.right[0, 0]) == int(pair.left[0, 0]) + 1
         assert source.figures().frames_left_out >= 2
+
+
+def test_a_publisher_that_is_too_fast_is_thinned_and_that_is_said():
+    with playing(), open_ros2("ros2:", SourceSettings()) as source:  # 50 Hz
+        live, stamps = LiveSource(source, None), []
+        for pair in live.frames():
+            time.sleep(0.1)
+            stamps.append(source.stamp_ns(pair.timestamp_s))
+            if len(stamps) == 6:
+                break
+        assert live.dropped > 6
+        assert np.diff(stamps).min() >= 2 * PERIOD_NS  # spread, not in a row
+        assert live.figures().live.frames_dropped == live.dropped
+        assert any("arrived too fast, dropped" in line for line in live.warnings())
 
 
 def bad_messages(number, at_ns):
