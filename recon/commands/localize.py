@@ -34,6 +34,7 @@ from recon.map.localize.sequence import (
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
 from recon.report.map_page import write_localize_page
+from recon.rig.capture import CameraSource
 from recon.run.finished import GRID, STATES, figure_of, refuse_as_target
 from recon.run.run import SUMMARY
 from recon.sources.live import LiveSource
@@ -195,8 +196,8 @@ class _Beginning(DerivedSource):
     def __init__(self, source: StereoSource) -> None:
         super().__init__(source)
         self._pairs = list[Recorded]()
-        begun_s = None
-        for pair in islice(source.frames(), _FIRST if source.live else _MOST):
+        begun_s, once = None, source.live or isinstance(source, CameraSource)
+        for pair in islice(source.frames(), _FIRST if once else _MOST):
             self._pairs.append(replace(pair, timestamp_s=len(self._pairs) * _PACE_S))
             begun_s = pair.timestamp_s if begun_s is None else begun_s
             if len(self._pairs) >= _FIRST and pair.timestamp_s - begun_s >= _LOOK_S:
