@@ -138,16 +138,19 @@ class Ros2Source(StereoSource):
         for topic, newest in self._rates.items():
             rows = list(newest)  # others are added meanwhile
             names = [f"{topic}, message {n}" for n in range(len(rows))]
-            record = imu_of(np.array(rows), names, topic)
-            T_imu_camera = self._to_camera(self._frames[topic])
-            if T_imu_camera is None:
-                return record
-            return replace(record, T_camera_imu=invert(T_imu_camera))
+            with self._refusing():
+                record = imu_of(np.array(rows), names, topic)
+                T_imu_camera = self._to_camera(self._frames[topic])
+                if T_imu_camera is None:
+                    return record
+                return replace(record, T_camera_imu=invert(T_imu_camera))
         return None
 
     def recent_path(self) -> Trajectory | None:
         poses = list(self._wheels)  # others are added meanwhile
-        T_child_camera = self._to_camera(poses[-1][1]) if poses else None
+        T_child_camera = None
+        with self._refusing():
+            T_child_camera = self._to_camera(poses[-1][1]) if poses else None
         if T_child_camera is None:
             return None
         times_ns, first = np.unique([one[0] for one in poses], return_index=True)
@@ -247,6 +250,8 @@ class Ros2Source(StereoSource):
 
     def _take(self, one: Received) -> None:
         message = one.parse()
+        if hasattr(message, "header"):
+            self._frames[one.topic] = str(message.header.frame_id).lstrip("/")
         if one.topic in self._waiting:
             self._check_time(one.topic, stamp_ns(message))
             self._alone += self._counting and len(self._waiting[one.topic]) == _WAITING
@@ -264,8 +269,6 @@ class Ros2Source(StereoSource):
                 self._wheels += poses
         else:
             self.latest[one.topic] = message
-        if hasattr(message, "header"):
-            self._frames[one.topic] = str(message.header.frame_id).lstrip("/")
 
     def _check_time(self, topic: str, at_ns: int) -> None:
         """Refuse an image whose time is not after those before; or those, if several say so."""

@@ -263,6 +263,24 @@ def test_an_inertial_unit_and_wheels_are_in_the_axes_of_the_camera():
     np.testing.assert_allclose(turn, np.eye(3), atol=1e-9)
 
 
+@pytest.mark.parametrize(("rate", "moved_m", "said"), [
+    (np.nan, 0.0, "IMU has no measurements"), (0.0, np.nan, "a static transform is no motion"),
+])  # fmt: skip
+def test_a_broken_unit_does_not_end_the_drive(caplog, rate, moved_m, said):
+    T_left_imu = make_transform(np.eye(3), np.array([moved_m, 0.0, 0.0]))
+
+    def sensors(number, at_ns):
+        yield "/imu", imu_message(at_ns, np.array([rate, 0.0, 0.0]), np.array([0.0, 0.0, 9.8]))
+        yield "/tf_static", transforms(at_ns, [*mount(), ("left", "imu", T_left_imu)])
+
+    with playing(also=sensors), open_ros2("ros2:", SourceSettings()) as source:
+        pairs_of(source, 4)
+        assert source.read_imu() is None
+        assert source.read_imu() is None
+        assert source.read_mount() is not None
+    assert [said in record.getMessage() for record in caplog.records] == [True]
+
+
 def test_a_pose_that_rviz_sends_is_given_out_once():
     turn = exp_so3(np.array([0.0, 0.0, 1.0]))
 
