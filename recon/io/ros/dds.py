@@ -37,10 +37,7 @@ _LOOPBACK: Final = """<CycloneDDS><Domain><General>
 <MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 _JOINING: Final = threading.Lock()  # a domain begins once
-_BASE: Final = {
-    "byte": "uint8",
-    "octet": "uint8",
-    "char": "uint8",
+_BASE: Final = dict.fromkeys(("byte", "octet", "char"), "uint8") | {
     "string": "str",
     "wstring": "str",
 }
