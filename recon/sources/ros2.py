@@ -220,7 +220,7 @@ class Ros2Source(StereoSource):
         """Yield images that belong together: each is the nearest of the other camera."""
         tolerance_ns = round(self._settings.tolerance_s / NS)
         left, right = (self._waiting[topic] for topic in self.images)
-        paired_s, quiet_s = time.monotonic(), _QUIET_S
+        paired_s, quiet_s, apart_ns = time.monotonic(), _QUIET_S, 0
         for _ in self._messages():
             while left and right:
                 late_ns = right[0].stamp_ns - left[0].stamp_ns
@@ -230,14 +230,20 @@ class Ros2Source(StereoSource):
                 )
                 if abs(late_ns) > tolerance_ns or nearer:
                     earlier.popleft()
+                    apart_ns = min(apart_ns or abs(late_ns), abs(late_ns))
                     self._alone += self._counting
                     continue
-                self._counting = True
+                self._counting, apart_ns = True, 0
                 paired_s, self._paired_ns = time.monotonic(), left[0].stamp_ns
                 yield left.popleft(), right.popleft()
             if time.monotonic() - paired_s > quiet_s:
                 waiting = ", ".join(f"{len(self._waiting[one])} of {one}" for one in self.images)
-                LOGGER.warning("no pair for %.0f s; images that wait: %s", quiet_s, waiting)
+                apart = (
+                    f"; stamps are {apart_ns * NS:.3f} s apart (--tolerance)" if apart_ns else ""
+                )
+                LOGGER.warning(
+                    "no pair for %.0f s; images that wait: %s%s", quiet_s, waiting, apart
+                )
                 quiet_s *= 2  # who is told each time reads none of it
 
     def _messages(self) -> Iterator[None]:
@@ -329,7 +335,11 @@ def open_ros2(
         MissingDependencyError: The extra ``ros2`` is not installed.
     """
     names = [name for name in address.removeprefix(ADDRESS).split(",") if name]
-    if len(names) > 2 or not all(name.startswith("/") for name in names):
+    if (
+        len(names) > 2
+        or len({*names}) < len(names)
+        or not all(one.startswith("/") for one in names)
+    ):
         what, expected = "not topics of two cameras", f"such as {ADDRESS}/left/image_raw"
         raise SettingsError(what, where=address, expected=expected)
     if settings.shift_frames:

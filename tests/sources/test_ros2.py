@@ -123,7 +123,7 @@ def test_topics_are_named_or_found(monkeypatch):
             pass
 
 
-@pytest.mark.parametrize("address", ["ros2:left", "ros2:/a,/b,/c", "ros2:/a,b"])
+@pytest.mark.parametrize("address", ["ros2:left", "ros2:/a,/b,/c", "ros2:/a,/a", "ros2:/a,b"])
 def test_an_address_that_is_none_is_one_line(address):
     with (
         pytest.raises(ReconError, match="not topics of two cameras"),
@@ -147,6 +147,15 @@ def test_images_are_paired_within_the_tolerance():
         for pair in pairs_of(source, 4):
             assert int(pair.right[0, 0]) == int(pair.left[0, 0]) + 1
         assert source.warnings() == []
+
+
+def test_cameras_that_never_agree_are_told_by_how_much_they_differ(caplog, monkeypatch):
+    monkeypatch.setattr(ros2, "_QUIET_S", 0.5)
+    until_s = time.monotonic() + 60.0
+    told = lambda: bool(caplog.records) or time.monotonic() > until_s  # noqa: E731
+    with playing(late_ns=20_000_000), open_ros2("ros2:", SourceSettings(), None, told) as source:
+        assert list(source.frames()) == []
+    assert "stamps are 0.020 s apart (--tolerance)" in caplog.text
 
 
 def test_images_without_a_partner_are_left_out_and_counted():
