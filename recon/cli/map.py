@@ -292,6 +292,7 @@ def live(
     with shared.one_line_errors(), ExitStack() as stack:
         from recon.cli.progress import announce
         from recon.commands.localize import run_live
+        from recon.map.map import Map
         from recon.rig.capture import is_camera, open_camera_source
         from recon.sources.ros2 import ADDRESS, open_ros2
 
@@ -306,6 +307,8 @@ def live(
         if source.startswith(ADDRESS):
             if right_camera is not None:
                 raise typer.BadParameter(f"both topics are one argument: {ADDRESS}/left,/right")
+            if map_ is not None:  # one that is none is said before cameras are waited for
+                stack.enter_context(Map.open(map_))
             topics = stack.enter_context(open_ros2(source, settings.source, prior, stopped))
             options = replace(options, writers=[topics.network], stamp_ns=topics.stamp_ns)
             drive = topics

@@ -20,7 +20,8 @@ Resolution = Annotated[
 
 def _bands(text: str) -> dict[str, list[list[float]]]:
     try:
-        bands = [[parse_number(end) for end in one.split(":")] for one in text.split(",")]
+        ends = [one.split(":") for one in text.split(",")]
+        bands = [[parse_number(low), parse_number(high)] for low, high in ends]
     except ValueError as error:
         what, expected = "not bands of heights", "0.1:0.5,0.5:2"
         raise SettingsError(what, where="--heights", got=text, expected=expected) from error

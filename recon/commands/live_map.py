@@ -88,7 +88,7 @@ class LiveMap:
         self._error: BaseException | None = None
         self._last_s, self._over = -math.inf, False
         self._newest = _Newest()
-        self._asking = Lock()
+        self._asking, self._pushing = Lock(), Lock()
         self._maps: MapBeside | GrowingMap | None = None
         self._made: MapSoFar | None = None
         self.summary: MapSummary | LocalizeSummary | None = None
@@ -126,21 +126,8 @@ class LiveMap:
         self._check()
         if self._over:
             raise SourceError("the drive is over: nothing can be pushed any more")
-        number, name = self._newest.pushed, f"pair {self._newest.pushed}"
-        now_s = float(time_s) if isinstance(time_s, int | float | np.number) else math.nan
-        if not self._last_s < now_s < math.inf:
-            what, expected = "not the time of a later pair", f"seconds after {self._last_s:g}"
-            raise SourceError(what, where=name, got=time_s, expected=expected)
-        images: tuple[Any, ...] = (left, right)
-        if not all(isinstance(one, np.ndarray) for one in images):
-            got = " and ".join(type(one).__name__ for one in images)
-            raise ShapeError("not two images", where=name, got=got, expected="uint8 arrays")
-        pair = StereoPair(left.copy(), right.copy(), now_s, number, name)
-        height_px, width_px = pair.left.shape[:2]
-        source = self._begin(width_px, height_px) if self._source is None else self._source
-        check_size(source.calibration, width_px, height_px, pair.name)
-        self._last_s, self._newest.pushed = now_s, self._newest.pushed + 1
-        source.push(pair)
+        with self._pushing:  # the first pair begins the work, once
+            self._push(left, right, time_s)
         self._check()
 
     @property
@@ -172,6 +159,23 @@ class LiveMap:
     def cloud(self) -> PointCloud:
         """Return the points of the map so far, frame ``map``; as `grid`."""
         return self._so_far().cloud
+
+    def _push(self, left: NDArray[np.uint8], right: NDArray[np.uint8], time_s: float) -> None:
+        number, name = self._newest.pushed, f"pair {self._newest.pushed}"
+        now_s = float(time_s) if isinstance(time_s, int | float | np.number) else math.nan
+        if not self._last_s < now_s < math.inf:
+            what, expected = "not the time of a later pair", f"seconds after {self._last_s:g}"
+            raise SourceError(what, where=name, got=time_s, expected=expected)
+        images: tuple[Any, ...] = (left, right)
+        if not all(isinstance(one, np.ndarray) for one in images):
+            got = " and ".join(type(one).__name__ for one in images)
+            raise ShapeError("not two images", where=name, got=got, expected="uint8 arrays")
+        pair = StereoPair(left.copy(), right.copy(), now_s, number, name)
+        height_px, width_px = pair.left.shape[:2]
+        source = self._begin(width_px, height_px) if self._source is None else self._source
+        check_size(source.calibration, width_px, height_px, pair.name)
+        self._last_s, self._newest.pushed = now_s, self._newest.pushed + 1
+        source.push(pair)
 
     def _begin(self, width_px: int, height_px: int) -> PushedSource:
         rig = self._calibration

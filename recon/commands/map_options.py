@@ -222,7 +222,8 @@ def _read_started(folder: Path) -> dict[str, Any]:
     path = state_folder(folder) / STARTED
     try:
         with Map.open(path) as map_:
-            started = _checked(map_.session().info.start)
+            start = map_.session().info.start
+            started = _checked(start) if start else {}
     except (ReconError, LookupError, TypeError) as error:
         if path.is_file():
             what = "the unfinished map cannot be read"
@@ -231,6 +232,9 @@ def _read_started(folder: Path) -> dict[str, Any]:
         hint = finished if (folder / RECORD).is_file() else "start it without --resume"
         what = "there is no unfinished run to resume"
         raise OutputError(what, where=folder, hint=hint) from error
+    if not started:
+        what, hint = "a drive that arrived live cannot be resumed", f"its map so far is {path}"
+        raise OutputError(what, where=folder, hint=hint)
     # As in this version: settings that are fixed by now are left out.
     config = ReconConfig.parse(started["identity"]["config"], where=str(folder))
     started["identity"]["config"] = config.model_dump(mode="json")

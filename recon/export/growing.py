@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -119,8 +120,11 @@ def _serve() -> None:
         except ReconError as error:
             found = {"error": str(error)}
         text, content = to_bytes(found, compress=False)
-        answers.writelines([json.dumps(text).encode(), b"\n", *content])
-        answers.flush()
+        try:
+            answers.writelines([json.dumps(text).encode(), b"\n", *content])
+            answers.flush()
+        except BrokenPipeError:  # who asked was killed: nobody is left to be told
+            os._exit(0)
 
 
 def _map_in(tree: dict[str, Any]) -> MapSoFar:

@@ -56,7 +56,7 @@ def imu_of(table: Float64, places: Sequence[str], where: str) -> ImuRecord:
     order = order[kept]
     if len(order) < _LEAST:
         got = f"{counted(len(table), 'row')}, of which {len(order)} can be used"
-        raise FormatError("IMU file has no measurements", where=where, got=got)
+        raise FormatError("IMU has no measurements", where=where, got=got)
     unused = np.setdiff1d(np.arange(len(table)), order)
     if len(unused):
         first, rows = places[unused[0]], f"{counted(len(unused), 'row')} of {len(table)}"

@@ -149,18 +149,11 @@ class PoseTeller:
     ) -> DrivePose:
         """Return a pose of a drive that is found in a map."""
         T_base_camera, T = self.base(T_map_world, camera_height_m), located.T_world_camera
-        drift = self._drifted(odometry.T_world_camera, odometry.health)
-        return DrivePose(
-            time_s,
-            odometry.T_world_camera,
-            T_base_camera,
-            drift,
-            odometry.health,
-            located.state,
-            None if T is None else T_map_world @ T,
-            located.covariance,
-            located.note,
-        )
+        T_world_camera, health = odometry.T_world_camera, odometry.health
+        drift = self._drifted(T_world_camera, health)
+        what = (time_s, T_world_camera, T_base_camera, drift, health)
+        T_map_camera = None if T is None else T_map_world @ T
+        return DrivePose(*what, located.state, T_map_camera, located.covariance, located.note)
 
     def base(self, T_map_world: Float64, camera_height_m: float | None) -> Float64:
         """Return ``T_base_camera`` (4, 4): as mounted, else by the height above the ground."""

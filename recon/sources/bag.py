@@ -286,7 +286,7 @@ def static_transform(edges: Iterable[BagPose], start: str, goal: str) -> Float64
             if there not in reached:
                 reached[there] = reached[here] @ T_here_there
                 waiting.append(there)
-    if goal not in reached and broken:
+    if goal and goal not in reached and broken:
         what, expected = "a static transform is no motion", "a quaternion of length 1"
         raise FormatError(what, got=broken[0], expected=f"finite numbers, {expected}")
     return reached.get(goal) if start and goal else None

@@ -89,7 +89,8 @@ def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> s
     place = Path(path)
     is_file, settings = place.is_file(), settings or SourceSettings()
     if not is_file and not place.is_dir():
-        raise SourceError("folder does not exist", where=path)
+        hint = "recon live takes topics" if str(path).startswith("ros2:") else None
+        raise SourceError("folder does not exist", where=path, hint=hint)
     if not is_file and not any(place.iterdir()):
         raise SourceError("folder is empty", where=path)
     for kind in KINDS:

@@ -138,16 +138,19 @@ class Ros2Source(StereoSource):
         for topic, newest in self._rates.items():
             rows = list(newest)  # others are added meanwhile
             names = [f"{topic}, message {n}" for n in range(len(rows))]
-            record = imu_of(np.array(rows), names, topic)
-            T_imu_camera = self._to_camera(self._frames[topic])
-            if T_imu_camera is None:
-                return record
-            return replace(record, T_camera_imu=invert(T_imu_camera))
+            with self._refusing():
+                record = imu_of(np.array(rows), names, topic)
+                T_imu_camera = self._to_camera(self._frames[topic])
+                if T_imu_camera is None:
+                    return record
+                return replace(record, T_camera_imu=invert(T_imu_camera))
         return None
 
     def recent_path(self) -> Trajectory | None:
         poses = list(self._wheels)  # others are added meanwhile
-        T_child_camera = self._to_camera(poses[-1][1]) if poses else None
+        T_child_camera = None
+        with self._refusing():
+            T_child_camera = self._to_camera(poses[-1][1]) if poses else None
         if T_child_camera is None:
             return None
         times_ns, first = np.unique([one[0] for one in poses], return_index=True)
@@ -217,7 +220,7 @@ class Ros2Source(StereoSource):
         """Yield images that belong together: each is the nearest of the other camera."""
         tolerance_ns = round(self._settings.tolerance_s / NS)
         left, right = (self._waiting[topic] for topic in self.images)
-        paired_s, quiet_s = time.monotonic(), _QUIET_S
+        paired_s, quiet_s, apart_ns = time.monotonic(), _QUIET_S, 0
         for _ in self._messages():
             while left and right:
                 late_ns = right[0].stamp_ns - left[0].stamp_ns
@@ -227,14 +230,20 @@ class Ros2Source(StereoSource):
                 )
                 if abs(late_ns) > tolerance_ns or nearer:
                     earlier.popleft()
+                    apart_ns = min(apart_ns or abs(late_ns), abs(late_ns))
                     self._alone += self._counting
                     continue
-                self._counting = True
+                self._counting, apart_ns = True, 0
                 paired_s, self._paired_ns = time.monotonic(), left[0].stamp_ns
                 yield left.popleft(), right.popleft()
             if time.monotonic() - paired_s > quiet_s:
                 waiting = ", ".join(f"{len(self._waiting[one])} of {one}" for one in self.images)
-                LOGGER.warning("no pair for %.0f s; images that wait: %s", quiet_s, waiting)
+                apart = (
+                    f"; stamps are {apart_ns * NS:.3f} s apart (--tolerance)" if apart_ns else ""
+                )
+                LOGGER.warning(
+                    "no pair for %.0f s; images that wait: %s%s", quiet_s, waiting, apart
+                )
                 quiet_s *= 2  # who is told each time reads none of it
 
     def _messages(self) -> Iterator[None]:
@@ -247,6 +256,8 @@ class Ros2Source(StereoSource):
 
     def _take(self, one: Received) -> None:
         message = one.parse()
+        if hasattr(message, "header"):
+            self._frames[one.topic] = str(message.header.frame_id).lstrip("/")
         if one.topic in self._waiting:
             self._check_time(one.topic, stamp_ns(message))
             self._alone += self._counting and len(self._waiting[one.topic]) == _WAITING
@@ -264,8 +275,6 @@ class Ros2Source(StereoSource):
                 self._wheels += poses
         else:
             self.latest[one.topic] = message
-        if hasattr(message, "header"):
-            self._frames[one.topic] = str(message.header.frame_id).lstrip("/")
 
     def _check_time(self, topic: str, at_ns: int) -> None:
         """Refuse an image whose time is not after those before; or those, if several say so."""
@@ -326,7 +335,11 @@ def open_ros2(
         MissingDependencyError: The extra ``ros2`` is not installed.
     """
     names = [name for name in address.removeprefix(ADDRESS).split(",") if name]
-    if len(names) > 2 or not all(name.startswith("/") for name in names):
+    if (
+        len(names) > 2
+        or len({*names}) < len(names)
+        or not all(one.startswith("/") for one in names)
+    ):
         what, expected = "not topics of two cameras", f"such as {ADDRESS}/left/image_raw"
         raise SettingsError(what, where=address, expected=expected)
     if settings.shift_frames:

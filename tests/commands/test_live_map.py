@@ -3,6 +3,7 @@
 import runpy
 import sys
 import threading
+from contextlib import suppress
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
@@ -130,6 +131,29 @@ def test_what_is_no_pair_is_refused_and_the_drive_goes_on(
             live.push(left, right, time_s)
         live.push(IMAGE, IMAGE, 2.0)
         slow.go.release(9)
+
+
+def test_threads_that_push_their_first_pairs_at_once_begin_one_drive(slow, street, monkeypatch):
+    made, both = [], threading.Barrier(2)
+
+    def source(*args: object, **kwargs: object) -> PushedSource:
+        with suppress(threading.BrokenBarrierError):  # nobody comes, if only one is made
+            both.wait(0.2)
+        made.append(PushedSource(*args, **kwargs))
+        return made[-1]
+
+    monkeypatch.setattr(live_map, "PushedSource", source)
+    slow.go.release(9)
+    with recon.LiveMap(street.calibration) as live:
+        refused: list[BaseException] = []
+        monkeypatch.setattr(threading, "excepthook", lambda told: refused.append(told.exc_value))
+        pushes = [threading.Thread(target=live.push, args=(IMAGE, IMAGE, 0.0)) for _ in range(2)]
+        for push in pushes:
+            push.start()
+        for push in pushes:
+            push.join(LONG_S)
+    assert len(made) == 1
+    assert ["not the time of a later pair" in str(error) for error in refused] == [True]
 
 
 def test_nothing_comes_of_nothing(slow, street, tmp_path):

@@ -13,7 +13,7 @@ import pytest
 from recon.core.errors import FormatError, OutputError
 from recon.core.geometry.se3 import as_step, as_transform, invert, make_transform
 from recon.core.values import RectifiedCamera
-from recon.export.growing import GrowingMap
+from recon.export.growing import GrowingMap, MapBeside
 from recon.export.occupancy import Flattening
 from recon.export.robot import RobotTopics
 from recon.io.ros import bag as bag_file
@@ -34,7 +34,7 @@ from recon.sources.source import Latency, LiveFigures, Mount, SourceFigures
 from recon.stereo.rectify.rectifier import RectificationSettings
 from recon.street.settings import StreetScene
 from tests.scenery.film import RIG, Film, film
-from tests.scenery.patience import be_patient
+from tests.scenery.patience import LONG_S, be_patient
 
 pytest.importorskip("rosbags")
 
@@ -327,6 +327,15 @@ def test_a_map_that_is_made_where_it_grows_is_the_whole_one(street, tmp_path):
     assert (made[-1].grid.cells == grid.cells).mean() > 0.99
     assert any(len(one.cloud) for one in made)
     assert made[-1].costs.cells.shape == grid.cells.shape
+
+
+def test_a_process_that_makes_maps_ends_silently_with_who_asked(tmp_path, capfd):
+    beside = MapBeside(tmp_path / "none.recon")
+    beside._process.stdout.close()  # as of a program that is killed while a map is made
+    beside._process.stdin.write(b"\n")
+    beside._process.stdin.close()
+    assert beside._process.wait(LONG_S) == 0
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.slow

@@ -219,7 +219,7 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     ("mesh --format step", "unknown mesh format (got step"),
     ("grid --set fusion.min_count=1", "no effect here"),
     ("grid --heights 0.1-2", "--heights: not bands of heights (got 0.1-2, expected 0.1:0.5,"),
-    ("grid --heights 0.1:0.5:2", "grid.heights_m"),
+    ("grid --heights 0.1:0.5:2", "--heights: not bands of heights"),
     ("grid --heights 0.1:", "not bands of heights"),
     ("grid --heights nan:1", "grid.heights_m"),
     ("grid --heights 2:0.5", "height band of the grid is empty (got 2 to 0.5 m)"),

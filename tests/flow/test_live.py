@@ -316,7 +316,27 @@ def test_a_drive_elsewhere_gets_a_warning_and_no_pose(even_map, tmp_path):
     assert (tmp_path / "found" / "trajectory_tum.txt").read_text() == ""
 
 
+def test_a_live_drive_that_was_killed_says_where_its_map_is(even_map, tmp_path):
+    """It cannot be gone on with, since what arrives in its own time does not arrive again."""
+    state = tmp_path / "run" / ".partial" / ".state"
+    state.mkdir(parents=True)
+    with Map.create(state / "map.recon") as map_, Map.open(even_map) as other:
+        map_.begin(replace(other.first.info, start={}))
+        map_.commit()
+    refused = run("map", "--resume", tmp_path / "run")
+    assert_refused(refused, "a drive that arrived live cannot be resumed")
+    assert "map.recon" in refused.err
+
+
+def test_a_map_that_is_none_is_said_before_cameras_are_waited_for(tmp_path, monkeypatch):
+    pytest.importorskip("cyclonedds")
+    monkeypatch.setattr("recon.sources.ros2.Network", lambda: pytest.fail("somebody is waited for"))
+    done = run("live", "ros2:", "--map", tmp_path / "none", "--out", tmp_path / "out")
+    assert_refused(done, "none")
+
+
 @pytest.mark.parametrize(("words", "said"), [
+    ("ros2:/left,/right --map {map}", "recon live takes topics"),
     ("{drive} --map missing", "missing"),
     ("{drive} --map {drive}", "map.recon"),
     ("{drive} --map {drive}/calib.txt", "not a map of recon"),

@@ -175,6 +175,20 @@ def test_the_environment_says_who_is_talked_to():
         configuration_of({"ROS_AUTOMATIC_DISCOVERY_RANGE": "EVERYBODY"})
 
 
+def test_the_configuration_of_the_environment_is_what_cyclone_gets(tmp_path):
+    """A domain that is begun with none of its own does not look at the environment."""
+    log = tmp_path / "cyclone.log"
+    tracing = f"<Verbosity>config</Verbosity><OutputFile>{log}</OutputFile>"
+    text = f"<CycloneDDS><Domain><Tracing>{tracing}</Tracing></Domain></CycloneDDS>"
+    (tmp_path / "there.xml").write_text(text)
+    code = "from recon.io.ros.dds import Network; Network(3).close()"
+    for uri in (text, f"file://{tmp_path / 'there.xml'}"):
+        environment = {**os.environ, "CYCLONEDDS_URI": uri}
+        subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+        assert str(log) in log.read_text()
+        log.unlink()
+
+
 @pytest.mark.parametrize("text", ["file:///nowhere/none.xml", "<CycloneDDS", "nowhere.xml"])
 def test_a_wrong_configuration_of_cyclone_is_one_line(text):
     """Cyclone would go on without, and talk to the whole network."""

@@ -74,9 +74,7 @@ def test_rows_that_are_no_measurement_are_left_out_and_said(noise, tmp_path, nam
 
 def test_a_file_without_measurements_and_axes_that_are_none_are_one_line(noise, tmp_path):
     unit = write(drives.write_euroc(noise, CAMERA, tmp_path), ["a,b"])
-    with pytest.raises(
-        ReconError, match=r"data\.csv: IMU file has no measurements .*1 row, of which 0"
-    ):
+    with pytest.raises(ReconError, match=r"data\.csv: IMU has no measurements .*1 row, of which 0"):
         open_source(tmp_path).read_imu()
     (unit / "data.csv").write_text("\n".join(ROWS))
     for text, said, axes in (

@@ -124,7 +124,7 @@ def test_topics_are_named_or_found(monkeypatch):
             pass
 
 
-@pytest.mark.parametrize("address", ["ros2:left", "ros2:/a,/b,/c", "ros2:/a,b"])
+@pytest.mark.parametrize("address", ["ros2:left", "ros2:/a,/b,/c", "ros2:/a,/a", "ros2:/a,b"])
 def test_an_address_that_is_none_is_one_line(address):
     with (
         pytest.raises(ReconError, match="not topics of two cameras"),
@@ -148,6 +148,15 @@ def test_images_are_paired_within_the_tolerance():
         for pair in pairs_of(source, 4):
             assert int(pair.right[0, 0]) == int(pair.left[0, 0]) + 1
         assert source.warnings() == []
+
+
+def test_cameras_that_never_agree_are_told_by_how_much_they_differ(caplog, monkeypatch):
+    monkeypatch.setattr(ros2, "_QUIET_S", 0.5)
+    until_s = time.monotonic() + 60.0
+    told = lambda: bool(caplog.records) or time.monotonic() > until_s  # noqa: E731
+    with playing(late_ns=20_000_000), open_ros2("ros2:", SourceSettings(), None, told) as source:
+        assert list(source.frames()) == []
+    assert "stamps are 0.020 s apart (--tolerance)" in caplog.text
 
 
 def test_images_without_a_partner_are_left_out_and_counted():
@@ -276,6 +285,24 @@ def test_an_inertial_unit_and_wheels_are_in_the_axes_of_the_camera():
     np.testing.assert_allclose(step_m, np.tile([0.1, 0.0, 0.0], (len(step_m), 1)), atol=1e-5)
     turn = invert(T_base_left)[:3, :3] @ path.T_world_camera[0, :3, :3]
     np.testing.assert_allclose(turn, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize(("rate", "moved_m", "said"), [
+    (np.nan, 0.0, "IMU has no measurements"), (0.0, np.nan, "a static transform is no motion"),
+])  # fmt: skip
+def test_a_broken_unit_does_not_end_the_drive(caplog, rate, moved_m, said):
+    T_left_imu = make_transform(np.eye(3), np.array([moved_m, 0.0, 0.0]))
+
+    def sensors(number, at_ns):
+        yield "/imu", imu_message(at_ns, np.array([rate, 0.0, 0.0]), np.array([0.0, 0.0, 9.8]))
+        yield "/tf_static", transforms(at_ns, [*mount(), ("left", "imu", T_left_imu)])
+
+    with playing(also=sensors), open_ros2("ros2:", SourceSettings()) as source:
+        pairs_of(source, 4)
+        assert source.read_imu() is None
+        assert source.read_imu() is None
+        assert source.read_mount() is not None
+    assert [said in record.getMessage() for record in caplog.records] == [True]
 
 
 def test_a_pose_that_rviz_sends_is_given_out_once():

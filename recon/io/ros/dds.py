@@ -37,10 +37,7 @@ _LOOPBACK: Final = """<CycloneDDS><Domain><General>
 <MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 _JOINING: Final = threading.Lock()  # a domain begins once
-_BASE: Final = {
-    "byte": "uint8",
-    "octet": "uint8",
-    "char": "uint8",
+_BASE: Final = dict.fromkeys(("byte", "octet", "char"), "uint8") | {
     "string": "str",
     "wstring": "str",
 }
@@ -91,7 +88,7 @@ def configuration_of(environment: Mapping[str, str] = os.environ) -> tuple[str |
     """
     if environment.get(_CYCLONE):
         _check_configuration(environment[_CYCLONE])
-        return None, f"as {_CYCLONE} says"
+        return None, f"the networks that {_CYCLONE} names"
     asked = environment.get(_RANGE, "").strip().upper() or "LOCALHOST"
     if asked == "SUBNET":
         return None, f"the local network, as {_RANGE} says"
@@ -123,7 +120,8 @@ class Network:
         own, self.reach = configuration_of()
         before = _sockets()
         with _JOINING, self._our_errors("the network cannot be joined"):
-            self._domain = _domain(self.domain, configuration or own or "")
+            configured = configuration or own or os.environ.get(_CYCLONE, "")
+            self._domain = _domain(self.domain, configured)
             self._participant = self._dds["domain"].DomainParticipant(self.domain)
             kinds = self._dds["builtin"].BuiltinTopicDcpsPublication
             self._endpoints = self._dds["builtin"].BuiltinDataReader(self._participant, kinds)
@@ -268,7 +266,7 @@ def _keep_inside(descriptors: set[int]) -> None:
 
 @cache
 def _domain(number: int, configuration: str) -> Any:
-    """Begin a domain, once in a process, as Cyclone has it; "" = as the environment says."""
+    """Begin a domain, once in a process, as Cyclone has it; "" = by its defaults."""
     return require("cyclonedds.domain", extra="ros2").Domain(number, configuration or None)
 
 
