@@ -307,6 +307,8 @@ def live(
         if source.startswith(ADDRESS):
             if right_camera is not None:
                 raise typer.BadParameter(f"both topics are one argument: {ADDRESS}/left,/right")
+            if rate != 1.0:
+                raise typer.BadParameter("--rate plays a recording; topics come at their own rate")
             if map_ is not None:  # one that is none is said before cameras are waited for
                 stack.enter_context(Map.open(map_))
             topics = stack.enter_context(open_ros2(source, settings.source, prior, stopped))

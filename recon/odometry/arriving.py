@@ -44,8 +44,9 @@ class ArrivingGyro:
     the first turns is not used, and that is said.
 
     Args:
-        recent: Gives what the unit measured in the last seconds; None = nothing yet.
-        R_camera_imu: (3, 3), to the axes of the rectified left camera, as stated.
+        recent: Gives what the unit measured in the last seconds; None = nothing yet. Where it does
+            not state how the unit lies to the camera, it is not used.
+        R_left: (3, 3), from the left camera as it is recorded to its rectified view.
         focal_px: Of the rectified camera: how well turns are seen.
         scale: Size of the scene against a road.
     """
@@ -53,12 +54,15 @@ class ArrivingGyro:
     def __init__(
         self,
         recent: Callable[[], ImuRecord | None],
-        R_camera_imu: Float64,
+        R_left: Float64,
         focal_px: float,
         scale: float = 1.0,
     ) -> None:
         self._recent, self._scale = recent, scale
-        self._R_camera_imu, self._bias, self._time_offset_s = R_camera_imu, np.zeros(3), 0.0
+        self._R_left = R_left
+        self._R_camera_imu: Float64 | None = None
+        self._said = False
+        self._bias, self._time_offset_s = np.zeros(3), 0.0
         self._covariance = np.diag(STATED**2)
         self._pixel_rad = 1.0 / focal_px
         self._seen: Motion | None = None
@@ -74,9 +78,10 @@ class ArrivingGyro:
     def guide(self, last: Motion, seen: Motion, to_s: float) -> Guided | None:
         """Return the turn since the last frame that was seen; None = it is not known to a pixel."""
         record = self._recent() if self.used else None
-        if record is None:
+        R_camera_imu = None if record is None else self._placed(record)
+        if record is None or R_camera_imu is None:
             return None
-        gyro = Gyro(record, self._R_camera_imu, self._bias, self._time_offset_s)
+        gyro = Gyro(record, R_camera_imu, self._bias, self._time_offset_s)
         if self._seen is None or seen.timestamp_s > self._seen.timestamp_s:
             gyro = self._learnt(gyro, self._seen, seen)
             self._seen = seen
@@ -87,6 +92,15 @@ class ArrivingGyro:
         guided = how.guide(last, seen, to_s)
         sure = guided is not None and np.deg2rad(guided.sigma_deg) <= self._pixel_rad
         return guided if sure else None
+
+    def _placed(self, record: ImuRecord) -> Float64 | None:
+        """Return how the unit lies to the camera (3, 3), as it is stated or was found since."""
+        if self._R_camera_imu is None and record.T_camera_imu is not None:
+            self._R_camera_imu = self._R_left @ record.T_camera_imu[:3, :3]
+        if self._R_camera_imu is None and not self._said:
+            self._said = True
+            LOGGER.warning("IMU not used: no static transform says how it lies to the camera")
+        return self._R_camera_imu
 
     def _learnt(self, gyro: Gyro, before: Motion | None, seen: Motion) -> Gyro:
         """Return the gyro, corrected by how the camera turned between two frames."""

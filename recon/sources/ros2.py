@@ -350,7 +350,7 @@ def open_ros2(
     named = dict(zip(("left", "right"), names, strict=False))
     settings = settings.model_copy(update=named)
     with closing(Network()) as network:
-        images, also, topics = _find_cameras(network, settings, address, stopped)
+        images, also, topics = _find_cameras(network, settings, address.rstrip(":"), stopped)
         source = Ros2Source(network, images, settings, stopped)
         _listen(source, network, topics, prior)
         sizes = [image.shape[:2] for image in source.first_images()]

@@ -39,7 +39,7 @@ KINDS = {kind.rpartition("/")[2]: kind for kind in message_types().fielddefs}
 
 def promised():
     page = (ROOT / "docs/on-a-robot.md").read_text()
-    table = page[page.index("## What is published") : page.index("*Kept* is")]
+    table = page[page.index("## What is published") : page.index("*Transient local*:")]
     return {
         name: kind for names, kind in OURS.findall(table) for name in re.findall(r"/\w+", names)
     }

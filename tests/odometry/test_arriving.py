@@ -13,6 +13,7 @@ FRAME_S = 0.1
 BIAS = np.array([0.01, -0.02, 0.015])
 R_CAMERA_IMU = exp_so3(np.array([0.3, -1.2, 0.4]))
 T0_S = 1_795_000_000.0
+STILL = np.eye(3)
 
 
 def pose_at(time_s):
@@ -22,7 +23,7 @@ def pose_at(time_s):
     return make_transform(turn, np.array([np.sin(t), 0.1 * t, 3.0 * t]))
 
 
-def record_until(time_s, *, rate_hz=200.0, scale=1.0, seed=0):
+def record_until(time_s, stated=R_CAMERA_IMU, *, rate_hz=200.0, scale=1.0, seed=0):
     """What a gyro with a bias and noise measured in the last ten seconds."""
     first = max(T0_S, time_s - 10.0)
     times_s = first + np.arange(int((time_s - first) * rate_hz) + 2) / rate_hz
@@ -35,7 +36,8 @@ def record_until(time_s, *, rate_hz=200.0, scale=1.0, seed=0):
     gyro = scale * (np.array(rates) @ R_CAMERA_IMU + BIAS)
     gyro += random.normal(scale=2e-4, size=gyro.shape)
     accel = np.tile([0.0, 0.0, 9.8], (len(times_s), 1))
-    return ImuRecord(times_s, gyro, accel, make_transform(R_CAMERA_IMU, np.zeros(3)), "imu")
+    T_camera_imu = None if stated is None else make_transform(stated, np.zeros(3))
+    return ImuRecord(times_s, gyro, accel, T_camera_imu, "imu")
 
 
 def drive(guide_at, frames):
@@ -50,7 +52,7 @@ def drive(guide_at, frames):
 def test_the_bias_of_a_gyro_is_learnt_within_seconds():
     now = [T0_S]
     stated = exp_so3(np.array([0.005, 0.0, -0.005])) @ R_CAMERA_IMU
-    guide = ArrivingGyro(lambda: record_until(now[0]), stated, FOCAL_PX)
+    guide = ArrivingGyro(lambda: record_until(now[0], stated), STILL, FOCAL_PX)
 
     def at(to_s):
         now[0] = to_s + 0.01
@@ -67,17 +69,34 @@ def test_the_bias_of_a_gyro_is_learnt_within_seconds():
 
 
 def test_a_guide_says_nothing_before_it_knows():
-    guide = ArrivingGyro(lambda: None, R_CAMERA_IMU, FOCAL_PX)
+    guide = ArrivingGyro(lambda: None, STILL, FOCAL_PX)
     assert all(one is None for one, _ in drive(lambda _: guide, 5))
-    early = ArrivingGyro(lambda: record_until(T0_S + 0.2), R_CAMERA_IMU, FOCAL_PX)
+    early = ArrivingGyro(lambda: record_until(T0_S + 0.2), STILL, FOCAL_PX)
     assert all(one is None for one, _ in drive(lambda _: early, 20))  # it stopped at 0.2 s
+
+
+def test_a_unit_that_is_nowhere_on_the_robot_is_said_once_and_used_once_it_is_placed(caplog):
+    now, where = [T0_S], [None]
+    guide = ArrivingGyro(lambda: record_until(now[0], where[0]), STILL, FOCAL_PX)
+
+    def at(to_s):
+        now[0] = to_s + 0.01
+        if to_s > T0_S + 1.0:
+            where[0] = R_CAMERA_IMU
+        return guide
+
+    found = [one for one, _ in drive(at, 60)]
+    assert all(one is None for one in found[:9])
+    assert sum(one is not None for one in found) > 30
+    [line] = [one.getMessage() for one in caplog.records]
+    assert line.startswith("IMU not used: no static transform")
 
 
 @pytest.mark.parametrize("fault", ["degrees", "axes"])
 def test_a_gyro_that_contradicts_the_cameras_is_not_used(fault, caplog):
     now, scale = [T0_S], float(np.rad2deg(1.0)) if fault == "degrees" else 1.0
     stated = R_CAMERA_IMU if fault == "degrees" else exp_so3(np.array([0.0, 0.0, 2.0]))
-    guide = ArrivingGyro(lambda: record_until(now[0], scale=scale), stated, FOCAL_PX)
+    guide = ArrivingGyro(lambda: record_until(now[0], stated, scale=scale), STILL, FOCAL_PX)
 
     def at(to_s):
         now[0] = to_s + 0.01
@@ -91,7 +110,7 @@ def test_a_gyro_that_contradicts_the_cameras_is_not_used(fault, caplog):
 
 def test_one_wrong_turn_does_not_spoil_what_was_learnt():
     now = [T0_S]
-    guide = ArrivingGyro(lambda: record_until(now[0]), R_CAMERA_IMU, FOCAL_PX)
+    guide = ArrivingGyro(lambda: record_until(now[0]), STILL, FOCAL_PX)
     before = Motion(pose_at(T0_S), T0_S)
     for number in range(1, 60):
         to_s = T0_S + number * FRAME_S

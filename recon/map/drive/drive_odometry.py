@@ -10,7 +10,6 @@ import numpy as np
 
 from recon.core.errors import ReconError, RegistrationError
 from recon.core.geometry.se3 import make_transform
-from recon.core.progress import LOGGER
 from recon.core.text import counted
 from recon.core.values import Trajectory
 from recon.map.settings import DriveSettings
@@ -94,15 +93,10 @@ def arriving_guide(
     if source.recent_path() is not None:
         camera = config.odometry.prior.model_copy(update={"axes": "camera"})
         return ArrivingPath(source.recent_path, camera)
-    record = source.read_imu() if config.odometry.imu else None
-    if record is None:
-        return None
-    if record.T_camera_imu is None:
-        LOGGER.warning("IMU not used: no static transform says how it lies to the camera")
+    if not config.odometry.imu:
         return None
     R_left = turns_of(source.calibration, config.rectification).R_left
-    R_camera_imu = R_left @ record.T_camera_imu[:3, :3]
-    return ArrivingGyro(source.read_imu, R_camera_imu, reconstructor.camera.focal_px, config.scale)
+    return ArrivingGyro(source.read_imu, R_left, reconstructor.camera.focal_px, config.scale)
 
 
 def imu_of(
