@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from threading import Condition, Thread
 from typing import Final
@@ -104,7 +105,8 @@ class LiveSource(DerivedSource):
             frames_not_matched=self._unmatched,
             latency_ms=latency_ms,
         )
-        return SourceFigures(live=live)
+        known = self.source.figures() if self.source.live else SourceFigures()
+        return replace(known, live=live)
 
     def warnings(self) -> list[str]:
         lines = self.source.warnings() if self.source.live else []

@@ -113,19 +113,19 @@ def _check_configuration(text: str) -> None:
 class Network:
     """A participant in a domain of ROS 2, until it is closed."""
 
-    def __init__(self, domain: int | None = None, configuration: str | None = None) -> None:
+    def __init__(self, domain: int | None = None) -> None:
         names = ("domain", "core", "builtin", "topic", "pub", "sub", "util")
         self._dds = {name: require(f"cyclonedds.{name}", extra="ros2") for name in names}
         self.domain = domain_of() if domain is None else domain
         own, self.reach = configuration_of()
         before = _sockets()
         with _JOINING, self._our_errors("the network cannot be joined"):
-            configured = configuration or own or os.environ.get(_CYCLONE, "")
-            self._domain = _domain(self.domain, configured)
+            configuration = own or os.environ.get(_CYCLONE, "")
+            self._domain = _domain(self.domain, configuration)
             self._participant = self._dds["domain"].DomainParticipant(self.domain)
             kinds = self._dds["builtin"].BuiltinTopicDcpsPublication
             self._endpoints = self._dds["builtin"].BuiltinDataReader(self._participant, kinds)
-        if own is not None and configuration is None:
+        if own is not None:
             _keep_inside(_sockets() - before)
         self._readers: list[_Reader] = []
         self._writers: dict[str, Any] = {}
@@ -222,7 +222,9 @@ class Network:
     def _our_errors(self, what: str) -> Iterator[None]:
         try:
             yield
-        except self._dds["core"].DDSException as error:
+        except (fault := self._dds["core"].DDSException) as error:
+            if error.code == fault.DDS_RETCODE_TIMEOUT:
+                return  # somebody takes nothing, and misses a message; the others go on
             where, got = f"domain {self.domain}", str(error)
             raise SourceError(what, where=where, got=got, hint=f"see {_CYCLONE}") from error
 
