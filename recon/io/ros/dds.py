@@ -192,7 +192,13 @@ class Network:
                 quality = self._quality(True, kept, 1 if kept else DEPTH)
                 publish = self._dds["pub"].DataWriter
                 self._writers[topic] = publish(self._participant, self._topic(topic, kind), quality)
-            self._writers[topic].write(_type_of(kind)(content))
+            fault = self._dds["core"].DDSException
+            try:
+                self._writers[topic].write(_type_of(kind)(content))
+            except fault as error:
+                # Who takes nothing for long misses messages; the others go on.
+                if error.code != fault.DDS_RETCODE_TIMEOUT:
+                    raise
 
     def close(self) -> None:
         """Leave the network. What is kept is gone then, as with any node of ROS 2."""
@@ -222,9 +228,7 @@ class Network:
     def _our_errors(self, what: str) -> Iterator[None]:
         try:
             yield
-        except (fault := self._dds["core"].DDSException) as error:
-            if error.code == fault.DDS_RETCODE_TIMEOUT:
-                return  # somebody takes nothing, and misses a message; the others go on
+        except self._dds["core"].DDSException as error:
             where, got = f"domain {self.domain}", str(error)
             raise SourceError(what, where=where, got=got, hint=f"see {_CYCLONE}") from error
 
