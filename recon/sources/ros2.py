@@ -49,6 +49,7 @@ from recon.sources.topics import (
 ADDRESS: Final = "ros2:"
 STATIC: Final = "/tf_static"
 INITIAL_POSE: Final = "/initialpose"
+_WHEELS: Final = tuple(kind for kind in POSES if kind not in TRANSFORMS)  # of one frame each
 _WITH_COVARIANCE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _PATIENCE_S: Final = 30.0  # for a driver that starts meanwhile
 _QUIET_S: Final = 2.0  # without a pair, after which it is said
@@ -148,14 +149,17 @@ class Ros2Source(StereoSource):
 
     def recent_path(self) -> Trajectory | None:
         poses = list(self._wheels)  # others are added meanwhile
-        T_child_camera = None
-        with self._refusing():
-            T_child_camera = self._to_camera(poses[-1][1]) if poses else None
-        if T_child_camera is None:
+        if not poses:
             return None
-        times_ns, first = np.unique([one[0] for one in poses], return_index=True)
-        T = np.stack([poses[k][2] for k in first.tolist()])
-        return Trajectory(T @ T_child_camera, times_ns * NS)
+        with self._refusing():
+            child, T_child_camera = poses[-1][1], self._to_camera(poses[-1][1])
+            if T_child_camera is None:
+                what, got = "no static transform leads to the camera", child or "an unnamed frame"
+                raise FormatError(what, where="odometry of the wheels", got=got)
+            times_ns, first = np.unique([one[0] for one in poses], return_index=True)
+            T = np.stack([poses[k][2] for k in first.tolist()])
+            return Trajectory(T @ T_child_camera, times_ns * NS)
+        return None
 
     def asked_start(self) -> Float64 | None:
         """Return ``T_map_base`` (4, 4) that was sent since the last call, as RViz does."""
@@ -403,8 +407,8 @@ def _listen(
     imu = find_imu(topics)
     wanted = [*source.images, *(one for one in (*infos, imu) if one is not None)]
     if prior is not None:
-        if prior not in topics or topics[prior].kind not in POSES:
-            got = ", ".join(name for name, one in topics.items() if one.kind in POSES)
+        if prior not in topics or topics[prior].kind not in _WHEELS:
+            got = ", ".join(name for name, one in topics.items() if one.kind in _WHEELS)
             what = "nobody publishes poses on this topic"
             raise SourceError(what, where=prior, got=f"poses on {got}" if got else "no poses")
         wanted.append(prior)
