@@ -151,16 +151,17 @@ class Ros2Source(StereoSource):
         poses = list(self._wheels)  # others are added meanwhile
         if not poses:
             return None
-        path = None
+        child, T_child_camera = poses[-1][1], None
         with self._refusing():
-            child, T_child_camera = poses[-1][1], self._to_camera(poses[-1][1])
+            T_child_camera = self._to_camera(child)
             if T_child_camera is None:
                 what, got = "no static transform leads to the camera", child or "an unnamed frame"
                 raise FormatError(what, where="odometry of the wheels", got=got)
-            times_ns, first = np.unique([one[0] for one in poses], return_index=True)
-            T = np.stack([poses[k][2] for k in first.tolist()])
-            path = Trajectory(T @ T_child_camera, times_ns * NS)
-        return path
+        if T_child_camera is None:
+            return None
+        times_ns, first = np.unique([one[0] for one in poses], return_index=True)
+        T = np.stack([poses[k][2] for k in first.tolist()])
+        return Trajectory(T @ T_child_camera, times_ns * NS)
 
     def asked_start(self) -> Float64 | None:
         """Return ``T_map_base`` (4, 4) that was sent since the last call, as RViz does."""
