@@ -154,10 +154,9 @@ class Ros2Source(StereoSource):
         child, T_child_camera = poses[-1][1], None
         with self._refusing():
             T_child_camera = self._to_camera(child)
-            if T_child_camera is None:
-                what, got = "no static transform leads to the camera", child or "an unnamed frame"
-                raise FormatError(what, where="odometry of the wheels", got=got)
         if T_child_camera is None:
+            what, got = "no static transform leads to the camera", child or "an unnamed frame"
+            self._refuse(FormatError(what, where="odometry of the wheels", got=got))
             return None
         times_ns, first = np.unique([one[0] for one in poses], return_index=True)
         T = np.stack([poses[k][2] for k in first.tolist()])
@@ -302,14 +301,17 @@ class Ros2Source(StereoSource):
 
     @contextmanager
     def _refusing(self) -> Iterator[None]:
-        """Say once of each fault of a topic that its messages are not used, and count them."""
         try:
             yield
         except ReconError as error:
-            fault = str(error.where), error.what
-            if fault not in self._refused:
-                LOGGER.warning("%s; not used", error)
-            self._refused[fault] += 1
+            self._refuse(error)
+
+    def _refuse(self, error: ReconError) -> None:
+        """Say once of each fault of a topic that its messages are not used, and count them."""
+        fault = str(error.where), error.what
+        if fault not in self._refused:
+            LOGGER.warning("%s; not used", error)
+        self._refused[fault] += 1
 
 
 def _matrix(pose: BagPose, where: str) -> Float64:
