@@ -15,6 +15,7 @@ from recon.core.values.arrays import Float64
 from recon.odometry.guide import MAX_SIGMAS, MIN_HELD, Guided
 from recon.odometry.imu import Gyro, ImuGuide
 from recon.odometry.imu_fit import LEAST_TURNS, NOISE, STATED
+from recon.odometry.pose import REPROJECTION_PX
 from recon.odometry.prior import MotionPrior
 from recon.odometry.settings import PriorSettings
 
@@ -67,7 +68,7 @@ class ArrivingGyro:
         self._pixel_rad = 1.0 / focal_px
         self._seen: Motion | None = None
         self._turns = self._contradicted = 0
-        self._unsteady_m2 = float("inf")
+        self._unsteady2 = float("inf")
         self.used = True
 
     @property
@@ -76,7 +77,7 @@ class ArrivingGyro:
         return self._bias
 
     def guide(self, last: Motion, seen: Motion, to_s: float) -> Guided | None:
-        """Return the turn since the last frame that was seen; None = it is not known to a pixel."""
+        """Return the turn since the last frame that was seen; None = features know it better."""
         record = self._recent() if self.used else None
         R_camera_imu = None if record is None else self._placed(record)
         if record is None or R_camera_imu is None:
@@ -85,12 +86,13 @@ class ArrivingGyro:
         if self._seen is None or seen.timestamp_s > self._seen.timestamp_s:
             gyro = self._learnt(gyro, self._seen, seen)
             self._seen = seen
-        if not (self.used and np.isfinite(self._unsteady_m2)):
+        if not (self.used and np.isfinite(self._unsteady2)):
             return None
-        step_m = float(np.sqrt(self._unsteady_m2))
-        how = ImuGuide(gyro, self._covariance, NOISE, 0.0, step_m, scale=self._scale)
+        unsteady = float(np.sqrt(self._unsteady2))
+        how = ImuGuide(gyro, self._covariance, NOISE, unsteady, 0.0, scale=self._scale)
         guided = how.guide(last, seen, to_s)
-        sure = guided is not None and np.deg2rad(guided.sigma_deg) <= self._pixel_rad
+        most_rad = REPROJECTION_PX * self._pixel_rad
+        sure = guided is not None and np.deg2rad(guided.sigma_deg) <= most_rad
         return guided if sure else None
 
     def _placed(self, record: ImuRecord) -> Float64 | None:
@@ -130,14 +132,13 @@ class ArrivingGyro:
         return gyro
 
     def _watch(self, before: Motion, seen: Motion, lasting_s: float) -> None:
-        """Average by how much the camera is elsewhere than at its last velocity."""
+        """Average the acceleration that moved the camera from where its last velocity led."""
         if not before.interval_s > 0:
             return
         moved = before.T_world_camera[:3, :3].T @ (
             seen.T_world_camera[:3, 3] - before.T_world_camera[:3, 3]
         )
-        off_m2 = float(np.mean((moved - lasting_s * before.velocity) ** 2))
-        known = np.isfinite(self._unsteady_m2)
-        self._unsteady_m2 = (
-            self._unsteady_m2 + (off_m2 - self._unsteady_m2) / _MEMORY if known else off_m2
-        )
+        changing_s2 = 0.5 * lasting_s * (lasting_s + before.interval_s)  # as in `ImuGuide`
+        off2 = float(np.mean(((moved - lasting_s * before.velocity) / changing_s2) ** 2))
+        before2 = self._unsteady2 if np.isfinite(self._unsteady2) else off2
+        self._unsteady2 = before2 + (off2 - before2) / _MEMORY

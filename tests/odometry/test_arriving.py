@@ -3,10 +3,17 @@
 import numpy as np
 import pytest
 
+from recon.commands.config import load_config
 from recon.core.geometry.se3 import Motion, angle_rad, exp_so3, invert, make_transform
 from recon.core.values import ImuRecord, Trajectory
 from recon.odometry.arriving import ArrivingGyro, ArrivingPath
+from recon.odometry.guide import MAX_SIGMAS
+from recon.odometry.protocol import OdometryFrame
+from recon.odometry.registry import make_odometry
 from recon.odometry.settings import PriorSettings
+from recon.sources.registry import open_source
+from recon.stereo.frame import FrameReconstructor
+from recon.stereo.rectify.rectifier import turns_of
 
 FOCAL_PX = 700.0
 FRAME_S = 0.1
@@ -14,6 +21,7 @@ BIAS = np.array([0.01, -0.02, 0.015])
 R_CAMERA_IMU = exp_so3(np.array([0.3, -1.2, 0.4]))
 T0_S = 1_795_000_000.0
 STILL = np.eye(3)
+ROOM = 0.05  # its size against a road
 
 
 def pose_at(time_s):
@@ -122,6 +130,52 @@ def test_one_wrong_turn_does_not_spoil_what_was_learnt():
         before = before.moved(seen, to_s)
     assert guide.used
     assert np.abs(guide.bias - BIAS).max() < 3e-3
+
+
+def test_where_the_camera_goes_is_the_less_sure_the_longer_it_was_not_seen():
+    now = [T0_S]
+    guide = ArrivingGyro(lambda: record_until(now[0]), STILL, FOCAL_PX)
+    before = Motion(pose_at(T0_S), T0_S)
+    for number in range(1, 60):
+        to_s = T0_S + number * FRAME_S
+        now[0] = to_s + 0.01
+        guide.guide(before, before, to_s)
+        before = before.moved(pose_at(to_s), to_s)
+    sigmas = []
+    for gap_s in (0.1, 0.4, 1.0):
+        now[0] = before.timestamp_s + gap_s + 0.01
+        found = guide.guide(before, before, before.timestamp_s + gap_s)
+        assert found is not None
+        off = invert(found.T_world_camera) @ pose_at(before.timestamp_s + gap_s)
+        assert np.linalg.norm(off[:3, 3]) < MAX_SIGMAS * np.sqrt(3) * found.sigma_m
+        sigmas.append(found.sigma_m)
+    assert sigmas[2] > 4 * sigmas[1] > 16 * sigmas[0]  # as the square of the time
+
+
+@pytest.mark.slow
+def test_a_room_is_lost_less_often_with_its_unit(recon_data):
+    """By frames up to seconds apart; the unit as it arrives, and for comparison none."""
+    source, config = open_source(recon_data / "rooms/euroc_v1_sparse"), load_config()
+    matcher = FrameReconstructor(source.calibration, config, threads=1)
+    R_left = turns_of(source.calibration, config.rectification).R_left
+    record, now = source.read_imu(), [0.0]
+
+    def recent():
+        near = np.abs(record.timestamps_s - now[0] + 5.0) < 5.01
+        return ImuRecord(
+            record.timestamps_s[near], record.gyro[near], record.accel[near],
+            record.T_camera_imu, record.origin,
+        )  # fmt: skip
+
+    frames = [OdometryFrame(*matcher.match_roughly(p), rough=True) for p in source.frames()]
+    lost = []
+    for guide in (None, ArrivingGyro(recent, R_left, matcher.camera.focal_px, ROOM)):
+        odometry = make_odometry("visual", config.odometry, None, ROOM, guide)
+        lost.append(0)
+        for frame in frames:
+            now[0] = frame.pair.timestamp_s
+            lost[-1] += not odometry.register(frame).health.ok
+    assert lost[1] <= 0.4 * lost[0]
 
 
 def test_wheels_guide_as_far_as_they_have_arrived():
