@@ -256,7 +256,7 @@ class _Guarded:
             writer.write(topic, time_ns, message, kept=kept)
         except Exception as error:  # noqa: BLE001 - of any writer; a map is not lost for it
             self.errors.append(error)
-            LOGGER.warning("warning: topics are not written any more: %s", error)
+            LOGGER.warning("topics are not written any more: %s", error)
             return False
         return True
 
