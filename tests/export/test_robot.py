@@ -251,7 +251,7 @@ def test_a_writer_that_fails_is_left_and_the_others_go_on(caplog):
         topics.on_pose(drive_pose(n, jumping(0)))
     assert len(out.of("/pose")) == 3
     assert [one.getMessage() for one in caplog.records] == [
-        "warning: topics are not written any more: the disk is full"
+        "topics are not written any more: the disk is full"
     ]
     assert topics.warnings() == ["topics were written only in part: the disk is full"]
 
