@@ -116,18 +116,24 @@ def test_a_gyro_that_contradicts_the_cameras_is_not_used(fault, caplog):
     assert line.startswith("IMU not used: it does not turn as the cameras do")
 
 
-def test_one_wrong_turn_does_not_spoil_what_was_learnt():
-    now = [T0_S]
-    guide = ArrivingGyro(lambda: record_until(now[0]), STILL, FOCAL_PX)
+def follow(guide, now, frames, wrong=None):
+    """Let a guide see frames, one of them wrongly; returns the last motion."""
     before = Motion(pose_at(T0_S), T0_S)
-    for number in range(1, 60):
+    for number in range(1, frames):
         to_s = T0_S + number * FRAME_S
         now[0] = to_s + 0.01
         guide.guide(before, before, to_s)
         seen = pose_at(to_s)
-        if number == 40:  # another thing that fills the image
+        if number == wrong:  # another thing that fills the image
             seen = seen @ make_transform(exp_so3(np.array([0.0, 0.3, 0.0])), np.zeros(3))
         before = before.moved(seen, to_s)
+    return before
+
+
+def test_one_wrong_turn_does_not_spoil_what_was_learnt():
+    now = [T0_S]
+    guide = ArrivingGyro(lambda: record_until(now[0]), STILL, FOCAL_PX)
+    follow(guide, now, 60, wrong=40)
     assert guide.used
     assert np.abs(guide.bias - BIAS).max() < 3e-3
 
@@ -135,13 +141,7 @@ def test_one_wrong_turn_does_not_spoil_what_was_learnt():
 def test_where_the_camera_goes_is_the_less_sure_the_longer_it_was_not_seen():
     now = [T0_S]
     guide = ArrivingGyro(lambda: record_until(now[0]), STILL, FOCAL_PX)
-    before = Motion(pose_at(T0_S), T0_S)
-    for number in range(1, 60):
-        to_s = T0_S + number * FRAME_S
-        now[0] = to_s + 0.01
-        guide.guide(before, before, to_s)
-        before = before.moved(pose_at(to_s), to_s)
-    sigmas = []
+    before, sigmas = follow(guide, now, 60), []
     for gap_s in (0.1, 0.4, 1.0):
         now[0] = before.timestamp_s + gap_s + 0.01
         found = guide.guide(before, before, before.timestamp_s + gap_s)
