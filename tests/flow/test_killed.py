@@ -128,7 +128,8 @@ def _frames(file: Path) -> int:
         return frames
 
 
-def test_a_live_drive_that_is_killed_leaves_a_map_that_opens(drive, tmp_path):
+def test_a_live_drive_that_is_killed_leaves_a_map_that_opens(tmp_path):
+    drive = street_drive(tmp_path / "drive", FRAMES, 512)  # poses are from images of half the size
     words, whole = ("live", drive, "--rate", 1000, "--no-mesh", "--out"), tmp_path / "whole"
     writes = count_writes(whole, *words, whole)
     assert _frames(whole / "map" / "map.recon") == FRAMES
