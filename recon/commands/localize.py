@@ -21,7 +21,6 @@ from recon.io.files import StrPath
 from recon.io.models.rasters import read_grid
 from recon.look.look import look_at
 from recon.map.drive.drive import Workspace
-from recon.map.drive.drive_odometry import mount_of
 from recon.map.drive.scale import measure_scene
 from recon.map.drive.sequence import map_sequence
 from recon.map.ground.axes import base_axes
@@ -84,13 +83,11 @@ def run_localize(
             drive = localize_sequence(source, workspace, config, start=start, note=note)
         has_grid = folder is not None and (folder / GRID).is_file()
         grid = read_grid(map_path / GRID) if has_grid else None
-        own, doubts = mount_of(source, config.rectification)
-        mount = own or map_.first.mount
         seen = [
             *before.findings,
             *rig.warnings(before.findings),
             *drive.warnings(),
-            *doubts,
+            *drive.doubts,
             *source.warnings(),
             *options.listener.warnings(),
         ]
@@ -100,13 +97,13 @@ def run_localize(
             T_map_world=map_.first.T_map_world,
             drive=drive.figures(),
             rig=rig.figures(),
-            base_frame=None if mount is None else mount.base,
+            base_frame=None if drive.mount is None else drive.mount.base,
             read=source.figures(),
             warnings=[*before.look.first, *map_.doubts, *seen],
         )
         made = LocalizeResult(source.name, str(map_path), drive, grid, summary)
         with run.stage("write"):
-            T_base_camera = base_axes(drive.T_map_world, height_m, mount)
+            T_base_camera = base_axes(drive.T_map_world, height_m, drive.mount)
             export_localized(drive, T_base_camera, run.content)
             write_states(run.path(STATES), drive.frames)
         with run.report(summary) as summary:

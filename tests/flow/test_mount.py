@@ -186,10 +186,12 @@ def test_another_robot_is_located_by_its_own_base(driven, mapped, tmp_path):
     ):
         out = tmp_path / name
         source = open_source(record(driven, tmp_path / f"{name}_bag", edges))
-        found = run_localize(source, run, CONFIG, MapOptions(audit=False, out=out))
+        found = run_localize(source, run, CONFIG, MapOptions(audit=False, out=out, bag=True))
         assert found.summary.base_frame == name
         assert len(found.drive.tracked) > 5
         check_base(out, T)
+        fixed = edges_of(out / "bag", "/tf_static")
+        np.testing.assert_allclose(fixed[name, "cam_rectified"], T, atol=1e-9)
 
 
 def test_each_drive_of_a_map_has_the_base_of_its_robot(mapped, tmp_path):

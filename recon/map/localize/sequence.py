@@ -28,7 +28,7 @@ from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile, known_places
 from recon.odometry.kiss import RANGE_M
 from recon.odometry.protocol import OdometryFrame
-from recon.sources.source import SourceFigures, StereoSource, check_source
+from recon.sources.source import Mount, SourceFigures, StereoSource, check_source
 from recon.stereo.frame import FrameReconstructor
 
 START_WITHIN_M: Final = 10.0  # how far from the start that is given the first fix may be
@@ -138,12 +138,15 @@ class LocalizedFigures(Figures):
 class LocalizedDrive:
     """A drive in a map: all its frames in order, and the seconds from the first to the last.
 
-    ``T_map_world``, float64 (4, 4), is from the world of the map to its axes.
+    ``T_map_world``, float64 (4, 4), is from the world of the map to its axes; ``mount`` where the
+    rectified left camera is on the robot, else on that of the map; ``doubts`` why it is not known.
     """
 
     frames: tuple[LocalizedFrame, ...]
     T_map_world: Float64
     seconds: float
+    mount: Mount | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def tracked(self) -> list[LocalizedFrame]:
@@ -234,7 +237,8 @@ def localize_sequence(
         return OdometryFrame(*reconstructor.match(pair))
 
     frames: list[LocalizedFrame] = []
-    mount, listener = mount_of(source, config.rectification)[0], workspace.listener
+    own, doubts = mount_of(source, config.rectification)
+    mount, listener = own or map_.first.mount, workspace.listener
     teller, T_map_world = PoseTeller(mount, config.scale), map_.first.T_map_world
     listener.on_begin(DriveBegun(source, reconstructor.camera, map_.store.path, True, mount))
     base = T_map_world, workspace.camera_height_m or config.ground.camera_height_m
@@ -264,7 +268,8 @@ def localize_sequence(
         listener.on_end()
     if not frames:
         raise RegistrationError("the source has no frame", where=source.name)
-    return LocalizedDrive(tuple(frames), T_map_world, time.perf_counter() - begun)
+    seconds = time.perf_counter() - begun
+    return LocalizedDrive(tuple(frames), T_map_world, seconds, mount, tuple(doubts))
 
 
 def _restart(localizer: Localizer, T_map_world: Float64, T_map_camera: Float64) -> None:
