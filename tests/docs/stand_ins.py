@@ -113,6 +113,12 @@ def recording(folder: Path) -> None:
     write_recon_calibration(folder / "calibration.yaml", camera)
 
 
+def distances(path: Path) -> None:
+    """A wall beside a free voxel, as `recon export --to esdf` writes them."""
+    cells, distance_m = np.array([[0, 0, 0], [0, 0, 1]], np.int32), np.array([-0.1, 0.1], "f4")
+    np.savez(path, shape=np.array([1, 1, 2]), cells=cells, distance_m=distance_m)
+
+
 def path_of_truth(path: Path) -> None:
     """On the clock of the bag."""
     times_s = true_path().timestamps_s + drives.EPOCH_S
@@ -230,6 +236,7 @@ class StandIn:
 
 
 STAND_INS = (
+    StandIn('np.load("outputs/next/map/esdf.npz")', distances, "outputs/next/map/esdf.npz"),
     StandIn("im0.png", partial(image, "left")),
     StandIn("im1.png", partial(image, "right")),
     StandIn("left.png right.png --", partial(image, "left"), "left.png"),
