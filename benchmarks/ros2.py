@@ -27,7 +27,7 @@ from typing import Any
 import checkout  # noqa: F401 - what is measured
 import numpy as np
 
-from recon.io.ros.contents import image_of, stamp_ns
+from recon.io.ros.contents import levels_of, stamp_ns
 from recon.io.ros.dds import Network, NetworkTopic
 from recon.io.ros.messages import header
 
@@ -120,7 +120,7 @@ def image_ms() -> dict[str, float]:
     for messages in network.receive(lambda: sender.poll() is not None):
         for one in messages:
             message = one.parse()
-            pixels = image_of(message, one.topic)
+            pixels = levels_of(message, one.topic)
             late_ms.append(1e-6 * (time.time_ns() - stamp_ns(message)))
             if pixels.shape != SIZE:
                 raise SystemExit(f"got {pixels.shape}")

@@ -9,11 +9,11 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from recon.core.text import counted, metres
-from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig
+from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig, StereoPair
 from recon.core.values.arrays import Float64
 from recon.look.look import Look
 from recon.look.rig import LATER, MOST_TIME_OFFSET, MOVES, RefinedRig
-from recon.look.sample import BLANK_DN, MIN_FEATURES, Gaps, Sample
+from recon.look.sample import BLANK_DN, MIN_FEATURES, Gaps, Sample, measure_mosaic
 from recon.look.settings import AuditedSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MatchingSettings, settings_taken
@@ -32,6 +32,7 @@ _BAD_EPIPOLAR_PX: Final = (
 _GAIN: Final = 1.2  # brightness ratio above which a finding is reported
 _SHARPNESS_RATIO: Final = 0.65  # one camera counts as blurred below, relative to the other
 _SHARPNESS: Final = 0.14  # both cameras count as blurred below this sharpness
+_MOSAIC: Final = 1.1  # from which images are a mosaic: photographs have up to 0.8, noise 1
 _REPEATED_RATIO: Final = 0.02  # fraction of repeated frames that is still accepted
 _FROZEN_FRAMES: Final = 3  # repeats in a row from which one camera counts as frozen
 _NEAR_RATIO: Final = 0.02  # fraction of features beyond the disparity range that is accepted
@@ -42,6 +43,8 @@ _TEXTS: Final = {
     "size error": "{error}",
     "black": "the {side} camera shows nothing: its images are uniform, at grey level {mean:.0f} of "
     "255; check its cable, its lens cap and its exposure (16-bit images must fill their range)",
+    "mosaic": "the images of the {side} camera are a Bayer mosaic: colours are to be made of it; in "
+    "a bag its encoding says so (bayer_rggb8 …), else record it demosaiced",
     "gain": "the right camera is {gain:.2f} times as bright as the left one; give both the same "
     "fixed exposure and gain{other}",
     "blur": "the {side} camera is blurred: sharpness {worse:.2f}, the other {better:.2f}; focus it "
@@ -123,6 +126,10 @@ def _of_images(sample: Sample, matcher: str | Matcher) -> Found:
     for side in _blank_sides(sample):
         mean = np.median([one.brightness_dn[side] for one in sample.pairs])
         yield "black", {"side": _SIDES[side], "mean": mean}
+    pairs = [one for one in sample.recorded if isinstance(one, StereoPair)]
+    for side, images in zip(_SIDES, zip(*((p.left, p.right) for p in pairs), strict=True)):
+        if np.median([measure_mosaic(image) for image in images]) > _MOSAIC:
+            yield "mosaic", {"side": side}
     if sample.sharpness is not None:
         left, right = sample.sharpness
         worse, better = min(left, right), max(left, right)

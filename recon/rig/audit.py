@@ -40,7 +40,7 @@ from recon.stereo.rectify.rectifier import turns_of
 _RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth error is predicted
 # Findings of a pair that images alone support, and those that need a calibration. The inspection of
 # the frame reports others.
-_BY_IMAGES: Final = frozenset({"black", "gain", "blur", "features"})
+_BY_IMAGES: Final = frozenset({"black", "mosaic", "gain", "blur", "features"})
 _BY_CALIBRATION: Final = frozenset({"size", "baseline", "near", "far"})
 # Fraction of pixels with a measured disparity below which a pair is warned of: real ones, even of
 # bare walls, exceed 40 %. It is also warned of where more was inferred than measured.

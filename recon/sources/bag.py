@@ -18,10 +18,9 @@ from recon.core.text import counted
 from recon.core.values import ImuRecord, StereoPair, Trajectory, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
-from recon.io.cameras.ros import (
-    NS,
-)
+from recon.io.cameras.ros import NS
 from recon.io.files import reading, refuse_special, resolved
+from recon.io.images.image import Levels, eight_bits, find_levels
 from recon.io.imu import imu_of
 from recon.io.positions import Positions, in_order, read_positions
 from recon.io.ros.contents import (
@@ -32,7 +31,7 @@ from recon.io.ros.contents import (
     BagPose,
 )
 from recon.sources.calibration import read_rig
-from recon.sources.images import find_partners
+from recon.sources.images import find_partners, sample_of
 from recon.sources.rosbags import Bag
 from recon.sources.settings import SourceSettings
 from recon.sources.source import BASES, Mount, ReadPrior, Recording, pair_frames
@@ -88,6 +87,15 @@ class BagSource(Recording):
         with reading(self.bag.paths[0]):
             return find_mount(_static_edges(self.bag), self.bag.frame_id(self.topics[0]))
 
+    @cached_property
+    def levels(self) -> Levels:
+        """What becomes black and white in all images of 16 bits; from a sample of both cameras."""
+        places = [(side, self.pairs[k][side]) for k in sample_of(len(self)) for side in (0, 1)]
+        return find_levels(
+            next(self.bag.images(self.topics[side], [number], self.recorded_ns[side]))
+            for side, number in places
+        )
+
     def frames(self, start: int = 0) -> Iterator[StereoPair]:
         if start >= len(self):
             return
@@ -103,7 +111,7 @@ class BagSource(Recording):
         for target, image in zip(wanted, images, strict=True):
             where = f"{self.bag.paths[0]}: {self.topics[side]}, message {target}"
             check_size(self.calibration, image.shape[1], image.shape[0], where)
-            yield image
+            yield image if image.dtype == np.uint8 else eight_bits(image, self.levels)
 
 
 def open_bag(path: Path, settings: SourceSettings) -> BagSource:

@@ -18,12 +18,18 @@ from recon.core.text import counted
 from recon.core.values import ImuRecord, Recorded, RectifiedCamera, check_size
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
-from recon.io.images.image import FULL_WHITE, MAX_MEGAPIXELS, find_white, read_image, read_levels
+from recon.io.images.image import (
+    MAX_MEGAPIXELS,
+    Levels,
+    eight_bits,
+    find_levels,
+    read_levels,
+)
 from recon.sources.settings import SourceSettings
 from recon.sources.source import FrameList, Recording, check_most, pair_frames
 from recon.sources.times import pair_stamps
 
-_WHITE_SAMPLE: Final = 8  # frames, over a drive of 16-bit images, that its white is taken from
+_SAMPLE: Final = 8  # frames, over a drive of 16-bit images, that its levels are taken from
 
 
 class ImageFrame(NamedTuple):
@@ -61,15 +67,11 @@ class ImageSource(Recording):
             yield join_pair(left, right, frame.timestamp_s, index, frame.left.name)
 
     @cached_property
-    def white(self) -> int:
-        """The 16-bit value that becomes white in all images; from a sample of both cameras."""
-        most = self._most_megapixels
-        if not self.images or read_levels(self.images[0].left, most).dtype == np.uint8:
-            return FULL_WHITE
-        chosen = np.unique(np.linspace(0, len(self.images) - 1, _WHITE_SAMPLE).astype(int))
-        frames = [self.images[index] for index in chosen]
+    def levels(self) -> Levels:
+        """What becomes black and white in all images; from a sample of both cameras."""
+        frames = [self.images[index] for index in sample_of(len(self.images))]
         files = (path for frame in frames for path in (frame.left, frame.right))
-        return find_white(read_levels(path, most) for path in files)
+        return find_levels(read_levels(path, self._most_megapixels) for path in files)
 
     @property
     def _most_megapixels(self) -> float:
@@ -79,9 +81,14 @@ class ImageSource(Recording):
         return max(MAX_MEGAPIXELS, camera.width_px * camera.height_px / 1e6)
 
     def _read(self, path: Path) -> UInt8:
-        image = read_image(path, self.white, self._most_megapixels)
+        image = read_levels(path, self._most_megapixels)
         check_size(self.calibration, image.shape[1], image.shape[0], path)
-        return image
+        return image if image.dtype == np.uint8 else eight_bits(image, self.levels)
+
+
+def sample_of(frames: int) -> list[int]:
+    """Return the frames that the levels of a drive of 16-bit images are taken from."""
+    return sorted({*np.linspace(0, frames - 1, _SAMPLE).astype(int).tolist()})
 
 
 def stamps_of(frames: Sequence[ImageFrame]) -> Float64:

@@ -20,7 +20,7 @@ from recon.io.images.disparity import read_disparity
 from recon.io.images.image import (
     MAX_MEGAPIXELS,
     eight_bits,
-    find_white,
+    find_levels,
     read_focal_length,
     read_levels,
 )
@@ -70,10 +70,10 @@ def open_middlebury(folder: Path, settings: SourceSettings) -> OnePair:
 
 
 def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> StereoPair:
-    """Read two images; of two 16-bit ones both are scaled to 8 bits by the brightest pixel."""
-    levels = [read_levels(path, max_megapixels) for path in (left, right)]
-    white = find_white(levels)
-    images = [eight_bits(each, white) for each in levels]
+    """Read two images; those of 16 bits are scaled to 8 bits alike."""
+    values = [read_levels(path, max_megapixels) for path in (left, right)]
+    levels = find_levels(values)
+    images = [eight_bits(each, levels) for each in values]
     sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in images]
     if sizes[0] != sizes[1]:
         what, got = "left and right images differ in size", f"left {sizes[0]}, right {sizes[1]}"

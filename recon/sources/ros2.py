@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, ReconError, SettingsError, SourceError
 from recon.core.geometry.se3 import invert, make_transform, rotation_from_quaternion
@@ -20,6 +21,7 @@ from recon.core.values import ImuRecord, Recorded, Rig, StereoPair, Trajectory, 
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
 from recon.io.cameras.ros import NS
+from recon.io.images.image import Levels, beyond, eight_bits, find_levels
 from recon.io.imu import imu_of
 from recon.io.ros.contents import (
     IMU,
@@ -27,8 +29,8 @@ from recon.io.ros.contents import (
     TRANSFORMS,
     BagPose,
     camera_info_of,
-    image_of,
     imu_row,
+    levels_of,
     poses_of,
     stamp_ns,
 )
@@ -56,6 +58,7 @@ _QUIET_S: Final = 2.0  # without a pair, after which it is said
 _BELIEVED: Final = 3  # images in a row that contradict the time of one before, which is wrong then
 _WAITING: Final = 10  # images of a camera that may wait for a partner
 _KEPT: Final = 1000  # pairs of which the stamp is known to the nanosecond
+_CLIPPED: Final = 0.01  # fraction of a 16-bit image that may be beyond black and white
 _FAST: Final = 2000  # messages of an inertial unit or of wheels that are kept: some seconds
 
 
@@ -96,6 +99,7 @@ class Ros2Source(StereoSource):
         self._mounted = dict[tuple[str, str], BagPose]()  # the last of each static transform
         self._rates = dict[str, deque[list[float]]]()  # ns, rates of turn, forces, of each unit
         self._start: Float64 | None = None
+        self._levels: Levels | None = None  # of 16-bit images
         self._wheels = deque[tuple[int, str, Float64]](maxlen=_FAST)
 
     def __len__(self) -> int:
@@ -113,8 +117,10 @@ class Ros2Source(StereoSource):
             if index == self._settings.end:
                 return
             with self._refusing():
-                images = (self._decoded(0, left), self._decoded(1, right))
-                pair = join_pair(*images, left.stamp_ns * NS, index, f"pair {index}")
+                values = [self._decoded(0, left), self._decoded(1, right)]
+                pair = join_pair(
+                    *self._eight_bits(values), left.stamp_ns * NS, index, f"pair {index}"
+                )
                 arrived_s = max(left.arrived_s, right.arrived_s)
                 self._sent[pair.timestamp_s] = left.stamp_ns, arrived_s
                 if len(self._sent) > _KEPT:
@@ -206,15 +212,15 @@ class Ros2Source(StereoSource):
             hint=f"domain {self.network.domain} was listened to, on {self.network.reach}",
         )
 
-    def first_images(self) -> tuple[UInt8, UInt8]:
+    def first_images(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the first image of each camera, of whatever size; they may be of two moments."""
-        sides = dict[str, UInt8]()
+        sides = dict[str, NDArray[Any]]()
 
         def decoded() -> bool:
             for topic, waiting in self._waiting.items():
                 with self._refusing():
                     if waiting:
-                        sides[topic] = image_of(waiting.pop().message, topic)
+                        sides[topic] = levels_of(waiting.pop().message, topic)
             return len(sides) == len(self.images)
 
         self.wait_for("images", decoded)
@@ -294,10 +300,23 @@ class Ros2Source(StereoSource):
             self._waiting[topic].clear()
         self._last_ns[topic] = at_ns
 
-    def _decoded(self, side: int, one: _Image) -> UInt8:
-        image = image_of(one.message, self.images[side])
+    def _decoded(self, side: int, one: _Image) -> NDArray[Any]:
+        image = levels_of(one.message, self.images[side])
         check_size(self.calibration, image.shape[1], image.shape[0], self.images[side])
         return image
+
+    def _eight_bits(self, images: Sequence[NDArray[Any]]) -> tuple[UInt8, UInt8]:
+        """Scale 16 bits by the first pair, and by more where much of a later one is beyond it."""
+        known, deep = self._levels, [one for one in images if one.dtype != np.uint8]
+        if deep and (known is None or max(beyond(one, known) for one in deep) > _CLIPPED):
+            found = find_levels(deep)
+            if known is not None:
+                found = Levels(min(known.black, found.black), max(known.white, found.white))
+                LOGGER.warning("brightness changes: of 16-bit images %d to %d are black to white "
+                               "from now on, %d to %d were", *found, *known)  # fmt: skip
+            self._levels = found
+        left, right = (eight_bits(one, self._levels or Levels(0, 255)) for one in images)
+        return left, right
 
     @contextmanager
     def _refusing(self) -> Iterator[None]:

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, ReconError, require
 from recon.core.text import counted
-from recon.core.values.arrays import Float64, UInt8
+from recon.core.values.arrays import Float64
 from recon.io.ros.contents import (
     TRANSFORMS,
     BagCameraInfo,
     BagPose,
     camera_info_of,
-    image_of,
     imu_row,
+    levels_of,
     poses_of,
 )
 from recon.io.ros.messages import NS_PER_S
@@ -61,7 +61,7 @@ class Bag:
 
     def images(
         self, topic: str, wanted: Sequence[int], recorded_ns: NDArray[np.int64]
-    ) -> Iterator[UInt8]:
+    ) -> Iterator[NDArray[Any]]:
         """Decode messages of increasing numbers; ``recorded_ns`` is when all were recorded."""
         start_ns = int(recorded_ns[wanted[0]])
         position = int(np.searchsorted(recorded_ns, start_ns))
@@ -73,7 +73,7 @@ class Bag:
                 raise FormatError("recording ends early", where=self.paths[0], got=got)
             position = target + 1
             where = f"{self.paths[0]}: {topic}, message {target}"
-            yield image_of(self._parse(found[2], topic), where)
+            yield levels_of(self._parse(found[2], topic), where)
 
     def camera_info(self, topic: str) -> BagCameraInfo:
         for _, _, content in self._messages([topic]):

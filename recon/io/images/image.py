@@ -36,7 +36,6 @@ from recon.core.values.arrays import UInt8
 from recon.io.atomic import write_bytes
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_bytes, reader, reading
 
-FULL_WHITE: Final = 65535
 MAX_MEGAPIXELS: Final = 100.0  # larger images are refused, unless more is asked for
 _PIXEL_BYTES: Final = 16  # more than a pixel takes in any file
 _LOG_LEVEL_LOCK: Final = Lock()
@@ -53,38 +52,78 @@ _ENCODINGS: Final[dict[str, tuple[int, int, int | None]]] = {
     "8uc4": (4, 8, cv2.COLOR_BGRA2RGB),
     "bayer_rggb8": (1, 8, cv2.COLOR_BayerBG2RGB), "bayer_bggr8": (1, 8, cv2.COLOR_BayerRG2RGB),
     "bayer_gbrg8": (1, 8, cv2.COLOR_BayerGR2RGB), "bayer_grbg8": (1, 8, cv2.COLOR_BayerGB2RGB),
+    "bayer_rggb16": (1, 16, cv2.COLOR_BayerBG2RGB), "bayer_bggr16": (1, 16, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg16": (1, 16, cv2.COLOR_BayerGR2RGB), "bayer_grbg16": (1, 16, cv2.COLOR_BayerGB2RGB),
+    "rgb16": (3, 16, None), "bgr16": (3, 16, cv2.COLOR_BGR2RGB),
     "yuv422": (2, 8, cv2.COLOR_YUV2RGB_UYVY), "uyvy": (2, 8, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, 8, cv2.COLOR_YUV2RGB_YUY2), "yuyv": (2, 8, cv2.COLOR_YUV2RGB_YUY2),
+    "nv12": (1, 8, cv2.COLOR_YUV2RGB_NV12), "nv21": (1, 8, cv2.COLOR_YUV2RGB_NV21),
 }  # fmt: skip
+_PLANES: Final = frozenset({"nv12", "nv21"})  # rows of colours of 2x2 pixels follow those of grey
+_OUTLIERS: Final = 1e-3  # fraction of pixels at either end that need not be told apart
+_ROOM: Final = 1 / 8  # around what a sample has, for images that are not in it
+
+
+class Levels(NamedTuple):
+    """Which 16-bit values become black and white."""
+
+    black: int
+    white: int
 
 
 def read_image(
-    path: StrPath, white: int = FULL_WHITE, max_megapixels: float = MAX_MEGAPIXELS
+    path: StrPath, levels: Levels | None = None, max_megapixels: float = MAX_MEGAPIXELS
 ) -> UInt8:
     """Read PNG, JPEG, PGM, PPM, BMP or TIFF: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
-    16 bits are scaled to 8: ``white`` (`find_white`) becomes 255. Alpha is dropped; the EXIF
-    orientation is ignored, as a calibration refers to the pixels as the sensor recorded them.
+    16 bits are scaled to 8 by ``levels``, None = those of this image (`find_levels`). Alpha is
+    dropped; the EXIF orientation is ignored: pixels are as the sensor recorded them.
 
     Raises:
         FormatError: The file is missing, truncated, not an image, has more than ``max_megapixels``
             (10⁶ pixels), or floating-point pixels.
     """
-    return eight_bits(read_levels(path, max_megapixels), white)
+    values = read_levels(path, max_megapixels)
+    return eight_bits(values, levels or find_levels([values]))
 
 
-def eight_bits(levels: NDArray[Any], white: int = FULL_WHITE) -> UInt8:
-    """Scale 16 bits to 8, rounded; brighter values than ``white`` are 255."""
-    if levels.dtype == np.uint8:
-        return levels
-    scaled = (levels.astype(np.uint32) * 255 + white // 2) // white
-    return np.minimum(scaled, 255).astype(np.uint8)
+def eight_bits(values: NDArray[Any], levels: Levels) -> UInt8:
+    """Scale 16 bits to 8, rounded; what is darker than black is 0, brighter than white 255."""
+    if values.dtype == np.uint8:
+        return values
+    black, span = levels.black, levels.white - levels.black
+    above = np.clip(np.arange(1 << 16) - black, 0, span)
+    scaled: UInt8 = ((above * 255 + span // 2) // span).astype(np.uint8)[values]
+    return scaled
 
 
-def find_white(images: Iterable[NDArray[Any]]) -> int:
-    """Return the largest value of a sensor of 8 to 16 bits, 2^n - 1; values may be unscaled."""
-    brightest = max((int(image.max()) for image in images if image.size), default=FULL_WHITE)
-    return int(2 ** max(8, brightest.bit_length()) - 1)
+def beyond(values: NDArray[Any], levels: Levels) -> float:
+    """Return the fraction of pixels that are darker than black, or brighter than white."""
+    return float(((values < levels.black) | (values > levels.white)).mean())
+
+
+def find_levels(images: Iterable[NDArray[Any]]) -> Levels:
+    """Return the levels for images, uint8 or uint16, of a sensor of 8 to 16 bits.
+
+    They are all that it can give, 0 to 2^n - 1 by the brightest value. Where nearly all pixels
+    take less than a quarter of that, as in thermal images and at night, they are what these take,
+    but no finer than what the sensor tells apart.
+    """
+    counts = np.zeros(1 << 16, np.int64)
+    for image in images:
+        counts += np.bincount(image.ravel(), minlength=counts.size)
+    if not counts.any():
+        return Levels(0, counts.size - 1)
+    brightest = int(np.flatnonzero(counts).max())
+    white = 2 ** max(8, brightest.bit_length()) - 1
+    total = np.cumsum(counts)
+    ends = np.array([_OUTLIERS, 1 - _OUTLIERS]) * total[-1]
+    low, high = np.searchsorted(total, ends).tolist()
+    if high - low >= white / 4:
+        return Levels(0, white)
+    span = max(255, round((high - low) * (1 + 2 * _ROOM)))
+    black = min(max(0, (low + high - span) // 2), white - span)
+    return Levels(black, black + span)
 
 
 @reader
@@ -94,10 +133,16 @@ def read_levels(path: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> NDArra
     return _decode(content, max_megapixels)
 
 
-def decode_image(content: bytes, where: StrPath) -> UInt8:
-    """Read an image like `read_image`, from bytes in memory."""
+def decode_levels(content: bytes, encoding: str, where: StrPath) -> NDArray[Any]:
+    """Read an image like `read_levels`, from bytes in memory.
+
+    Where it is grey and ``encoding``, of ROS, is a Bayer pattern, colours are made of it.
+    """
     with reading(where):
-        return eight_bits(_decode(content, MAX_MEGAPIXELS))
+        values, name = _decode(content, MAX_MEGAPIXELS), encoding.lower()
+    grey = values.ndim == 2 and name.startswith("bayer_")
+    code = _ENCODINGS.get(name, (0, 0, None))[2] if grey else None
+    return values if code is None else np.asarray(cv2.cvtColor(values, code))
 
 
 def _decode(content: bytes, max_megapixels: float) -> NDArray[Any]:
@@ -190,10 +235,10 @@ def pixels_of_ros_image(
     *,
     big_endian: bool = False,
     where: str = "",
-) -> UInt8:
-    """Decode the bytes (N,) of a ROS image message: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
+) -> NDArray[Any]:
+    """Decode the bytes (N,) of a ROS image message, whose rows are ``step`` bytes long.
 
-    Rows are ``step`` bytes long; 16-bit pixels are scaled over their full range.
+    Returns uint8 or uint16, (H, W) if it is grey, else (H, W, 3) RGB.
 
     Ref: ``sensor_msgs/image_encodings.hpp``.
     """
@@ -203,20 +248,24 @@ def pixels_of_ros_image(
         raise FormatError(what, where=where, got=encoding, expected=expected)
     height_px, width_px = shape
     channels, bits, to_rgb = _ENCODINGS[name]
-    row = width_px * channels * bits // 8
-    if step < row or data.size < step * (height_px - 1) + row or min(shape) < 1:
+    row, rows = width_px * channels * bits // 8, height_px
+    if name in _PLANES:
+        rows = height_px * 3 // 2
+        step = width_px if data.size == rows * width_px else step  # some write bytes of a pixel
+        if height_px % 2 or width_px % 2:
+            got, what = f"{width_px}x{height_px} pixels of {name}", "image has an odd size"
+            raise FormatError(what, where=where, got=got, expected="even numbers of pixels")
+    if step < row or data.size < step * (rows - 1) + row or min(shape) < 1:
         got = f"{counted(data.size, 'byte')}, {step} per row"
         expected = f"{width_px}x{height_px} pixels of {name}"
         what = "image message has too few bytes"
         raise FormatError(what, where=where, got=got, expected=expected)
-    rows = np.lib.stride_tricks.as_strided(data, (height_px, row), (step, 1))
-    pixels = np.ascontiguousarray(rows)
+    pixels = np.ascontiguousarray(np.lib.stride_tricks.as_strided(data, (rows, row), (step, 1)))
     if bits == 16:
-        wide = pixels.view(">u2" if big_endian else "<u2")
-        return ((wide.astype(np.uint32) + 128) // 257).astype(np.uint8)
+        pixels = pixels.view(">u2" if big_endian else "<u2").astype(np.uint16)
     if channels > 1:
         pixels = pixels.reshape(height_px, width_px, channels)
-    return pixels if to_rgb is None else np.asarray(cv2.cvtColor(pixels, to_rgb), dtype=np.uint8)
+    return pixels if to_rgb is None else np.asarray(cv2.cvtColor(pixels, to_rgb))
 
 
 _PNG_START, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"

@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from recon.core.values.arrays import Float64, UInt8
-from recon.io.images.image import decode_image, pixels_of_ros_image
+from recon.core.values.arrays import Float64
+from recon.io.images.image import decode_levels, pixels_of_ros_image
 from recon.io.ros.messages import NS_PER_S
 
 IMAGE: Final = "sensor_msgs/msg/Image"
@@ -54,10 +55,12 @@ def stamp_ns(message: Any) -> int:
     return int(message.header.stamp.sec) * NS_PER_S + int(message.header.stamp.nanosec)
 
 
-def image_of(message: Any, where: str) -> UInt8:
-    """Decode an image, raw or compressed: uint8, (H, W) grey or (H, W, 3) RGB."""
+def levels_of(message: Any, where: str) -> NDArray[Any]:
+    """Decode an image, raw or compressed: uint8 or uint16, (H, W) grey or (H, W, 3) RGB."""
     if hasattr(message, "format"):
-        return decode_image(message.data.tobytes(), where)
+        # Such as "bayer_rggb8; jpeg compressed": what was compressed, and how.
+        encoding = str(message.format).partition(";")[0].strip()
+        return decode_levels(message.data.tobytes(), encoding, where)
     shape, big_endian = (message.height, message.width), bool(message.is_bigendian)
     how = message.encoding, shape, message.step
     return pixels_of_ros_image(message.data, *how, big_endian=big_endian, where=where)
