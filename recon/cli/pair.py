@@ -88,13 +88,13 @@ def pair(
         from recon.sources.one_pair import read_pair_input, with_truth
 
         settings = _settings(shared, ndisp)
+        unit = {} if unit_m is None else {"metres_per_unit": unit_m}
         given = read_pair_input(
             left,
             right,
             calib,
             known=settings.source,
-            metres_per_unit=unit_m or settings.source.metres_per_unit,
-            max_megapixels=settings.readable_megapixels,
+            settings=settings.readable.model_copy(update=unit),
         )
         run = run_pair(
             with_truth(given, truth),
@@ -135,8 +135,7 @@ def disparity(
             left,
             right,
             calib,
-            metres_per_unit=settings.source.metres_per_unit,
-            max_megapixels=settings.readable_megapixels,
+            settings=settings.readable,
         )
         run = run_disparity(given, settings, out=out, threads=shared.threads)
     shared.show(run.summary)

@@ -43,8 +43,8 @@ _TEXTS: Final = {
     "size error": "{error}",
     "black": "the {side} camera shows nothing: its images are uniform, at grey level {mean:.0f} of "
     "255; check its cable, its lens cap and its exposure (16-bit images must fill their range)",
-    "mosaic": "the images of the {side} camera are a Bayer mosaic: colours are to be made of it; in "
-    "a bag its encoding says so (bayer_rggb8 …), else record it demosaiced",
+    "mosaic": "images of the {side} camera are a Bayer mosaic: colours are to be made of it; in a "
+    "bag the encoding is to say so (bayer_rggb8 …), else record them demosaiced",
     "gain": "the right camera is {gain:.2f} times as bright as the left one; give both the same "
     "fixed exposure and gain{other}",
     "blur": "the {side} camera is blurred: sharpness {worse:.2f}, the other {better:.2f}; focus it "
@@ -127,9 +127,9 @@ def _of_images(sample: Sample, matcher: str | Matcher) -> Found:
         mean = np.median([one.brightness_dn[side] for one in sample.pairs])
         yield "black", {"side": _SIDES[side], "mean": mean}
     pairs = [one for one in sample.recorded if isinstance(one, StereoPair)]
-    for side, images in zip(_SIDES, zip(*((p.left, p.right) for p in pairs), strict=True)):
-        if np.median([measure_mosaic(image) for image in images]) > _MOSAIC:
-            yield "mosaic", {"side": side}
+    for name in _SIDES if pairs else ():
+        if np.median([measure_mosaic(getattr(pair, name)) for pair in pairs]) > _MOSAIC:
+            yield "mosaic", {"side": name}
     if sample.sharpness is not None:
         left, right = sample.sharpness
         worse, better = min(left, right), max(left, right)

@@ -77,17 +77,13 @@ def _detail(image: Float32) -> float:
 
 
 def measure_mosaic(image: UInt8) -> float:
-    """Return by how much pixels differ from their neighbours, relative to those two pixels away.
+    """Return by how much pixels differ from neighbours, relative to those two pixels away.
 
-    In photographs it is less than 1, in noise 1. In a Bayer mosaic it is more, as only pixels that
-    are two away have the same colour.
+    Below 1 in photographs, 1 in noise, above in a Bayer mosaic, whose colours are two pixels apart.
     """
     grey = (image if image.ndim == 2 else image[:, :, 1]).astype(np.int16)
-    near, far = (
-        min(float(np.abs(one[step:] - one[:-step]).mean()) for one in (grey, grey.T))
-        for step in (1, 2)
-    )
-    return near / far if far > 0 else 0.0
+    both = [[np.abs(one[by:] - one[:-by]).mean() for one in (grey, grey.T)] for by in (1, 2)]
+    return float(min(both[0]) / max(*both[1], 1e-9))
 
 
 @dataclass

@@ -11,15 +11,7 @@ import numpy as np
 
 from recon.core.errors import CalibrationError, MatchingError
 from recon.core.progress import stage
-from recon.core.summary import (
-    Figures,
-    Rows,
-    RunSummary,
-    hidden,
-    inline,
-    optional,
-    shown_path,
-)
+from recon.core.summary import Figures, Rows, RunSummary, hidden, inline, optional, shown_path
 from recon.core.text import counted, metres
 from recon.core.values import Disparity, Reason, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Final
 
@@ -23,13 +23,7 @@ from recon.io.files import reading, refuse_special, resolved
 from recon.io.images.image import Levels, eight_bits, find_levels
 from recon.io.imu import imu_of
 from recon.io.positions import Positions, in_order, read_positions
-from recon.io.ros.contents import (
-    CAMERA_INFO,
-    FIX,
-    POSES,
-    TRANSFORMS,
-    BagPose,
-)
+from recon.io.ros.contents import CAMERA_INFO, FIX, POSES, TRANSFORMS, BagPose
 from recon.sources.calibration import read_rig
 from recon.sources.images import find_partners, sample_of
 from recon.sources.rosbags import Bag
@@ -130,9 +124,12 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         source = f"calibration {settings.calibration or 'in numbers'}"
     else:
         infos = [bag.camera_info(name) for name in info_topics(bag.topics, topics, path)]
-        (rig, note), texts = rig_of_infos(infos[0], infos[1], topics, path, size), ()
+        between = partial(_between, bag, topics)
+        (rig, note), texts = rig_of_infos(infos[0], infos[1], topics, path, size, between), ()
         source = "its CameraInfo" + (f" ({note})" if note else "")
     also += _list_others(bag, topics)
+    lost = [f"{name}: {counted(count, 'image')} before the first keyframe of the video: left out"
+            for name, count in bag.lost.items() if count]  # fmt: skip
     kind = {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(bag.paths[0].suffix, "ROS 2 bag")
     return BagSource(
         name=resolved(path).name,
@@ -147,7 +144,7 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
         recorded_ns=recorded_ns,
         texts=texts,
         stamped=not clock,
-        notes=(note,) if note else (),
+        notes=(*([note] if note else []), *lost),
     )
 
 
@@ -330,6 +327,13 @@ def _root_above(base: str, edges: Sequence[BagPose]) -> str:
 def _static_edges(bag: Bag) -> list[BagPose]:
     topics = [t.name for t in bag.topics.values() if t.kind in TRANSFORMS and _STATIC in t.name]
     return [pose for topic in topics for pose in bag.poses(topic)]
+
+
+def _between(bag: Bag, topics: tuple[str, str]) -> Float64 | None:
+    """Return T_right_left (4, 4) of images by the static transforms; None = unknown."""
+    left, right = map(bag.frame_id, topics)
+    with reading(bag.paths[0]):
+        return static_transform(_static_edges(bag), right, left)
 
 
 def read_measured(path: Path) -> Positions:

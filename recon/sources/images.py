@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from recon.core.errors import SourceError
+from recon.core.errors import CalibrationError, FormatError, SourceError
 from recon.core.text import counted
 from recon.core.values import ImuRecord, Recorded, RectifiedCamera, check_size
 from recon.core.values.arrays import Float64, UInt8
@@ -24,12 +24,15 @@ from recon.io.images.image import (
     eight_bits,
     find_levels,
     read_levels,
+    read_orientation,
 )
 from recon.sources.settings import SourceSettings
 from recon.sources.source import FrameList, Recording, check_most, pair_frames
 from recon.sources.times import pair_stamps
 
 _SAMPLE: Final = 8  # frames, over a drive of 16-bit images, that its levels are taken from
+_SAY: Final = "say how images lie: --set source.orientation=stored, or =turned"
+Opened = TypeVar("Opened")
 
 
 class ImageFrame(NamedTuple):
@@ -47,6 +50,8 @@ class ImageSource(Recording):
     images: Sequence[ImageFrame]
     imu: Callable[[], ImuRecord] | None = None  # reads what the inertial unit measured
     truth_of_raw: bool = False
+    turned: bool = False  # by EXIF orientations
+    orientation: int | None = None  # that all images must have; None = any
 
     @cached_property
     def files(self) -> Sequence[Path]:
@@ -81,7 +86,8 @@ class ImageSource(Recording):
         return max(MAX_MEGAPIXELS, camera.width_px * camera.height_px / 1e6)
 
     def _read(self, path: Path) -> UInt8:
-        image = read_levels(path, self._most_megapixels)
+        check_orientation(path, self.orientation)
+        image = read_levels(path, self._most_megapixels, turned=self.turned)
         check_size(self.calibration, image.shape[1], image.shape[0], path)
         return image if image.dtype == np.uint8 else eight_bits(image, self.levels)
 
@@ -89,6 +95,45 @@ class ImageSource(Recording):
 def sample_of(frames: int) -> list[int]:
     """Return the frames that the levels of a drive of 16-bit images are taken from."""
     return sorted({*np.linspace(0, frames - 1, _SAMPLE).astype(int).tolist()})
+
+
+def open_fitting(
+    open_: Callable[[SourceSettings], Opened],
+    settings: SourceSettings,
+    first: Callable[[Opened], Path | None],
+) -> tuple[Opened, dict[str, Any]]:
+    """Open images as stored, or turned by their EXIF orientation, whichever the calibration fits.
+
+    Returns also ``turned``, ``orientation`` and ``notes`` of an `ImageSource`. ``first`` gives the
+    first image. Where sizes leave it open and the settings do not say it, it is a `SourceError`.
+    """
+    if settings.orientation is not None:
+        return open_(settings), {"turned": settings.orientation == "turned"}
+    tag, fits, errors = 1, dict[str, Opened](), []
+    for how in ("stored", "turned"):
+        try:
+            opened = fits[how] = open_(settings.model_copy(update={"orientation": how}))
+            path = first(opened)
+            tag = 1 if path is None else read_orientation(path)
+            if tag == 1:
+                return opened, {"orientation": path and 1}
+        except CalibrationError as error:  # noqa: PERF203 - of two
+            errors.append(error)
+    if not fits:
+        raise errors[0]
+    if len(fits) > 1:
+        what = "images have an EXIF orientation, and the calibration fits them turned and stored"
+        raise SourceError(what, where=path, got=tag, expected=1, hint=_SAY)
+    (how,) = fits
+    note = f"images have EXIF orientation {tag}: taken as {how}, as the calibration has their size"
+    return fits[how], {"turned": how == "turned", "orientation": tag, "notes": (note,)}
+
+
+def check_orientation(path: Path, expected: int | None) -> None:
+    """Refuse an image whose EXIF orientation is not that of the first; None = any is right."""
+    if expected is not None and (found := read_orientation(path)) != expected:
+        what = "EXIF orientation of the image is not that of the first"
+        raise FormatError(what, where=path, got=found, expected=expected, hint=_SAY)
 
 
 def stamps_of(frames: Sequence[ImageFrame]) -> Float64:
@@ -133,7 +178,8 @@ def existing(path: Path) -> Path | None:
 
 def image_size(path: Path, settings: SourceSettings) -> tuple[int, int]:
     """Return width and height of an image file, at most as large as the settings allow."""
-    height_px, width_px = read_levels(path, settings.max_megapixels).shape[:2]
+    turned = settings.orientation == "turned"
+    height_px, width_px = read_levels(path, settings.max_megapixels, turned=turned).shape[:2]
     return width_px, height_px
 
 

@@ -26,6 +26,7 @@ from recon.io.images.image import (
 )
 from recon.io.middlebury import read_middlebury_scene, stand_in_camera
 from recon.sources.calibration import CALIBRATE, camera_of_numbers, check_given_once, read_rig
+from recon.sources.images import check_orientation, open_fitting
 from recon.sources.settings import SourceSettings
 from recon.sources.source import StereoSource, pair_frames
 
@@ -69,9 +70,15 @@ def open_middlebury(folder: Path, settings: SourceSettings) -> OnePair:
     return OnePair(scene.pair, rig, files, "a Middlebury scene: one rectified pair")
 
 
-def read_pair(left: StrPath, right: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> StereoPair:
-    """Read two images; those of 16 bits are scaled to 8 bits alike."""
-    values = [read_levels(path, max_megapixels) for path in (left, right)]
+def read_pair(
+    left: StrPath,
+    right: StrPath,
+    max_megapixels: float = MAX_MEGAPIXELS,
+    *,
+    turned: bool = False,
+) -> StereoPair:
+    """Read two images, perhaps turned by EXIF; those of 16 bits are scaled to 8 bits alike."""
+    values = [read_levels(path, max_megapixels, turned=turned) for path in (left, right)]
     levels = find_levels(values)
     images = [eight_bits(each, levels) for each in values]
     sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in images]
@@ -107,8 +114,7 @@ def read_pair_input(
     calibration: Path | None,
     *,
     known: SourceSettings | None = None,
-    metres_per_unit: float = 1.0,
-    max_megapixels: float = MAX_MEGAPIXELS,
+    settings: SourceSettings | None = None,
 ) -> PairInput:
     """Read two images with their calibration; without one the pair is rectified.
 
@@ -117,19 +123,25 @@ def read_pair_input(
     """
     if known is not None:
         check_given_once(calibration, known)
-    pair = read_pair(left, right, max_megapixels)
-    height_px, width_px = pair.left.shape[:2]
-    if calibration is None:
-        given = PairInput(pair, stand_in_camera(width_px, height_px), (left, right))
-        return given if known is None else _with_camera(given, known)
-    size, cameras = (width_px, height_px), kitti_cameras_of(left)
-    rig = read_calibration(calibration, *size, metres_per_unit=metres_per_unit, cameras=cameras)
-    return PairInput(pair, rig, (left, right, calibration))
+
+    def read(settings: SourceSettings) -> PairInput:
+        turned, unit_m = settings.orientation == "turned", settings.metres_per_unit
+        pair = read_pair(left, right, settings.max_megapixels, turned=turned)
+        size, cameras = (pair.left.shape[1], pair.left.shape[0]), kitti_cameras_of(left)
+        if calibration is None:
+            return PairInput(pair, stand_in_camera(*size), (left, right))
+        rig = read_calibration(calibration, *size, metres_per_unit=unit_m, cameras=cameras)
+        return PairInput(pair, rig, (left, right, calibration))
+
+    given, turn = open_fitting(read, settings or known or SourceSettings(), lambda _: left)
+    check_orientation(right, turn.get("orientation"))
+    given = replace(given, notes=turn.get("notes", ()))
+    return given if known is None or calibration is not None else _with_camera(given, known)
 
 
 def _with_camera(given: PairInput, known: SourceSettings) -> PairInput:
     height_px, width_px = given.pair.left.shape[:2]
-    notes, instead = [], {"baseline_m": 1.0}
+    notes, instead = [*given.notes], {"baseline_m": 1.0}
     if known.focal_px is None:
         left = given.files[0]
         found = read_focal_length(left, width_px, height_px)

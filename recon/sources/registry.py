@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -14,6 +15,7 @@ from recon.io.trajectory import FRAMES
 from recon.sources.bag import BAGS, find_bags, open_bag
 from recon.sources.calibration import RIG_FILE
 from recon.sources.folders import find_views, open_folders
+from recon.sources.images import ImageSource, open_fitting
 from recon.sources.kitti import open_kitti, open_kitti_raw
 from recon.sources.listed import DEPTH, is_euroc, list_files, open_euroc, open_rgbd, open_tum
 from recon.sources.one_pair import open_middlebury
@@ -70,7 +72,9 @@ def open_source(
         if kind in _NAMELESS:
             hint = "leave it out; --source folders takes image folders of any name"
             settings.refuse_names(("left", "right"), path, hint)
-        source = opening[kind](Path(path), settings)
+        source, turn = open_fitting(partial(opening[kind], Path(path)), settings, _first_image)
+    if isinstance(source, ImageSource):
+        source = replace(source, **turn)
     if not isinstance(source, Recording):
         return source
 
@@ -82,6 +86,10 @@ def open_source(
         return source
     note = f"{rig} is not used: the drive has a calibration of its own; --calib takes it instead"
     return source if rig in source.texts else replace(source, notes=(*source.notes, note))
+
+
+def _first_image(source: StereoSource) -> Path | None:
+    return source.images[0].left if isinstance(source, ImageSource) else None
 
 
 def recognise_source(path: StrPath, settings: SourceSettings | None = None) -> str:

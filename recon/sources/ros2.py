@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -21,12 +22,13 @@ from recon.core.values import ImuRecord, Recorded, Rig, StereoPair, Trajectory, 
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.image import join_pair
 from recon.io.cameras.ros import NS
-from recon.io.images.image import Levels, beyond, eight_bits, find_levels
+from recon.io.images.image import Levels, eight_bits, find_levels
 from recon.io.imu import imu_of
 from recon.io.ros.contents import (
     IMU,
     POSES,
     TRANSFORMS,
+    VIDEOS,
     BagPose,
     camera_info_of,
     imu_row,
@@ -117,10 +119,8 @@ class Ros2Source(StereoSource):
             if index == self._settings.end:
                 return
             with self._refusing():
-                values = [self._decoded(0, left), self._decoded(1, right)]
-                pair = join_pair(
-                    *self._eight_bits(values), left.stamp_ns * NS, index, f"pair {index}"
-                )
+                images = self._eight_bits(self._decoded(0, left), self._decoded(1, right))
+                pair = join_pair(*images, left.stamp_ns * NS, index, f"pair {index}")
                 arrived_s = max(left.arrived_s, right.arrived_s)
                 self._sent[pair.timestamp_s] = left.stamp_ns, arrived_s
                 if len(self._sent) > _KEPT:
@@ -178,6 +178,13 @@ class Ros2Source(StereoSource):
         return static_transform(
             [*self._mounted.values()], frame, self._frames.get(self.images[0], "")
         )
+
+    def between(self) -> Float64 | None:
+        """Wait until a static transform connects both cameras; return ``T_right_left`` (4, 4)."""
+        find = partial(self._to_camera, self._frames.get(self.images[1], ""))
+        what = "a baseline: in P of a CameraInfo, or as a static transform between both cameras"
+        self.wait_for(what, lambda: find() is not None)
+        return find()
 
     def warnings(self) -> list[str]:
         out = f"{counted(self._alone, 'image')} without a partner: left out"
@@ -305,18 +312,18 @@ class Ros2Source(StereoSource):
         check_size(self.calibration, image.shape[1], image.shape[0], self.images[side])
         return image
 
-    def _eight_bits(self, images: Sequence[NDArray[Any]]) -> tuple[UInt8, UInt8]:
+    def _eight_bits(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[UInt8, UInt8]:
         """Scale 16 bits by the first pair, and by more where much of a later one is beyond it."""
-        known, deep = self._levels, [one for one in images if one.dtype != np.uint8]
-        if deep and (known is None or max(beyond(one, known) for one in deep) > _CLIPPED):
+        known, deep = self._levels, [one for one in (left, right) if one.dtype != np.uint8]
+        if deep and (known is None or max(_beyond(one, known) for one in deep) > _CLIPPED):
             found = find_levels(deep)
             if known is not None:
                 found = Levels(min(known.black, found.black), max(known.white, found.white))
-                LOGGER.warning("brightness changes: of 16-bit images %d to %d are black to white "
-                               "from now on, %d to %d were", *found, *known)  # fmt: skip
+                LOGGER.warning("16-bit images: %d to %d are black to white now, not %d to %d",
+                               *found, *known)  # fmt: skip
             self._levels = found
-        left, right = (eight_bits(one, self._levels or Levels(0, 255)) for one in images)
-        return left, right
+        levels = self._levels or Levels(0, 255)
+        return eight_bits(left, levels), eight_bits(right, levels)
 
     @contextmanager
     def _refusing(self) -> Iterator[None]:
@@ -331,6 +338,10 @@ class Ros2Source(StereoSource):
         if fault not in self._refused:
             LOGGER.warning("%s; not used", error)
         self._refused[fault] += 1
+
+
+def _beyond(values: NDArray[Any], levels: Levels) -> float:
+    return float(((values < levels.black) | (values > levels.white)).mean())
 
 
 def _matrix(pose: BagPose, where: str) -> Float64:
@@ -389,7 +400,7 @@ def open_ros2(
             infos = info_topics(topics, images, source.name)
             source.wait_for("CameraInfo", lambda: all(one in source.latest for one in infos))
             left, right = (camera_info_of(source.latest[one]) for one in infos)
-            rig, note = rig_of_infos(left, right, images, source.name, size)
+            rig, note = rig_of_infos(left, right, images, source.name, size, source.between)
             known = "their CameraInfo" + (f" ({note})" if note else "")
         source.calibration = rig
         source.description = (
@@ -406,7 +417,8 @@ def _find_cameras(
     stage(f"look for cameras in domain {network.domain}, on {network.reach}")
     end_s, before = time.monotonic() + _PATIENCE_S, -1
     while True:
-        topics = {one.name: Topic(one.name, one.kind) for one in network.topics().values()}
+        known = [one for one in network.topics().values() if one.kind not in VIDEOS]
+        topics = {one.name: Topic(one.name, one.kind) for one in known}
         settled, before = len(topics) == before, len(topics)
         try:
             images, also = choose_topics(topics, settings, where)

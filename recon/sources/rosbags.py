@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import struct
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from itertools import islice
@@ -17,11 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.errors import FormatError, ReconError, require
+from recon.core.errors import FormatError, ReconError, SourceError, require
 from recon.core.text import counted
 from recon.core.values.arrays import Float64
+from recon.io.images.packets import BEGINS, codec_of, decode_packets
 from recon.io.ros.contents import (
     TRANSFORMS,
+    VIDEO,
+    VIDEOS,
     BagCameraInfo,
     BagPose,
     camera_info_of,
@@ -44,28 +48,57 @@ class Bag:
         typesys = require("rosbags.typesys", extra="ros")
         store = typesys.Stores.ROS1_NOETIC if self._ros1 else typesys.Stores.ROS2_HUMBLE
         self._store = typesys.get_typestore(store)
-        for kind in TRANSFORMS:
+        moved = dict.fromkeys(TRANSFORMS, "geometry_msgs/TransformStamped[] transforms\n")
+        for kind, fields in (moved | VIDEOS).items():
             if kind not in self._store.types:
-                fields = "geometry_msgs/TransformStamped[] transforms\n"
                 self._store.register(typesys.get_types_from_msg(fields, kind))
+        self._codecs = dict[str, str | None]()  # of topics of images; None = no video
+        self._begins = defaultdict[str, list[int]](list)  # messages where a video can begin
+        self.lost = Counter[str]()  # messages of a video before the first of these
         self.topics = self._find_topics()
 
     def scan(self, topics: Sequence[str]) -> dict[str, NDArray[np.int64]]:
-        """Return of each topic int64 (N, 2), ns: time of recording, in order, and header stamp."""
+        """Return of each topic int64 (N, 2), ns: time of recording, in order, and header stamp.
+
+        Of a video it begins with the first message from which it can be decoded.
+        """
         times: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
         for topic, recorded_ns, content in self._messages(topics):
-            times[topic].append((recorded_ns, self._stamp_ns(content, topic)))
+            if topic not in self._codecs or self._codecs[topic]:
+                self._note(topic, content, len(times[topic]))
+            if self._codecs[topic] is None or self._begins[topic]:
+                times[topic].append((recorded_ns, self._stamp_ns(content, topic)))
+        for topic in (name for name in self.lost if not times[name]):
+            got = f"{counted(self.lost[topic], 'message')} of {topic}"
+            raise SourceError("video has no keyframe", where=self.paths[0], got=got)
         return {
             topic: np.array(found, dtype=np.int64).reshape(-1, 2) for topic, found in times.items()
         }
+
+    def _note(self, topic: str, content: bytes, number: int) -> None:
+        """Note whether a topic is a video, and can be begun with this message, its next."""
+        message = self._parse(content, topic)
+        form = getattr(message, "format", getattr(message, "encoding", ""))
+        if (codec := self._codecs.setdefault(topic, codec_of(form))) is not None:
+            if BEGINS[codec].search(message.data.tobytes()):
+                self._begins[topic].append(number)
+            self.lost[topic] += not self._begins[topic]
 
     def images(
         self, topic: str, wanted: Sequence[int], recorded_ns: NDArray[np.int64]
     ) -> Iterator[NDArray[Any]]:
         """Decode messages of increasing numbers; ``recorded_ns`` is when all were recorded."""
-        start_ns = int(recorded_ns[wanted[0]])
+        codec, first = self._codecs.get(topic), wanted[0]
+        if codec is not None:
+            first = max(number for number in self._begins[topic] if number <= first)
+        start_ns = int(recorded_ns[first])
         position = int(np.searchsorted(recorded_ns, start_ns))
         messages = self._messages([topic], start_ns)
+        if codec is not None:
+            packets = (self._parse(one[2], topic).data.tobytes() for one in messages)
+            where = f"{self.paths[0]}: {topic}"
+            yield from decode_packets(enumerate(packets, position), wanted, codec, where)
+            return
         for target in wanted:
             found = next(islice(messages, target - position, None), None)
             if found is None:
@@ -83,7 +116,8 @@ class Bag:
     def frame_id(self, topic: str) -> str:
         """Return the coordinate frame that the first image of a topic names; empty if none."""
         for _, _, content in self._messages([topic]):
-            return str(self._parse(content, topic).header.frame_id).lstrip("/")
+            message = self._parse(content, topic)
+            return str(getattr(message, "header", message).frame_id).lstrip("/")
         return ""
 
     def poses(self, topic: str) -> Iterator[BagPose]:
@@ -148,10 +182,11 @@ class Bag:
             return self._store.deserialize_cdr(content, kind)
 
     def _stamp_ns(self, content: bytes, topic: str) -> int:
-        """Return the header stamp: all supported types begin with a header."""
+        """Return the header stamp: all supported types begin with a header, or with a stamp."""
         try:
-            if self._ros1:
-                _, seconds, nanoseconds = struct.unpack_from("<III", content)
+            if self._ros1:  # where a header begins with a number
+                at = 0 if self.topics[topic].kind == VIDEO else 4
+                seconds, nanoseconds = struct.unpack_from("<II", content, at)
             else:
                 # The second byte of CDR gives the byte order.
                 order = "<" if content[1] & 1 else ">"

@@ -70,7 +70,11 @@ class SourceSettings(Settings):
     metres, such as [0, 143, 118.3]: it shows the baseline, and with it the scale. none = the
     baseline as calibrated."""
     side_by_side: SideBySide = "left-right"
-    """Arrangement of the two views in the frames of one video, or of one camera."""
+    """Arrangement of the two views in the frames of one video, or of one camera. left-right =
+    top-bottom, where the calibration fits that alone."""
+    orientation: Literal["stored", "turned"] | None = None
+    """Whether JPEG images are taken as the sensor stored them, or turned as their EXIF data say.
+    none = whichever the calibration fits; images are refused where it fits both."""
 
     def named_in(self, folder: Path) -> tuple[Path, Path] | None:
         """Return the left and right file that are named of a folder; None = neither is."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from recon.core.errors import CalibrationError, SourceError
-from recon.core.values import CameraIntrinsics, Rig
+from recon.core.geometry.se3 import invert, make_transform, orthonormalise
+from recon.core.values import CameraIntrinsics, Rig, StereoCalibration, check_side_by_side
+from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import projected_rig
 from recon.io.cameras.ros import (
     ROS_MODELS,
@@ -19,12 +22,13 @@ from recon.io.cameras.ros import (
     step_between,
 )
 from recon.io.files import StrPath, reading
-from recon.io.ros.contents import CAMERA_INFO, COMPRESSED, IMAGE, IMU, BagCameraInfo
+from recon.io.ros.contents import CAMERA_INFO, COMPRESSED, IMAGE, IMU, VIDEOS, BagCameraInfo
 from recon.sources.calibration import CALIBRATE, as_rectified
 from recon.sources.images import find_partners, partner_names
 from recon.sources.settings import SourceSettings
 
-IMAGES: Final = (IMAGE, COMPRESSED)
+IMAGES: Final = (IMAGE, COMPRESSED, *VIDEOS)
+_TRANSPORT: Final = re.compile("/(compressed|ffmpeg)$")  # in names, after that of the images
 
 
 class Topic(NamedTuple):
@@ -43,6 +47,7 @@ class Topic(NamedTuple):
 
 
 Topics = Mapping[str, Topic]
+Between = Callable[[], Float64 | None]  # gives T_right_left (4, 4) of the images; None = unknown
 
 
 def list_topics(topics: Topics, kinds: Sequence[str]) -> str:
@@ -66,8 +71,10 @@ def rig_of_infos(
     images: Sequence[str],
     where: StrPath,
     size: tuple[int, int],
+    between: Between = lambda: None,
 ) -> tuple[Rig, str]:
     """Return the rig of the CameraInfo of images (width, height), and a note on it or none."""
+    left, right = (_of_images(one, size, where) for one in (left, right))
     stated, rectified = (left.width_px, left.height_px), all(map(is_rectified, images))
     other = are_rectified((left.K, right.K), (left.P, right.P), stated, size)
     if other or 0 in stated:
@@ -76,8 +83,28 @@ def rig_of_infos(
         f"K and D of the CameraInfo are not of these images of {size[0]}x{size[1]} pixels, "
         "and P is: they are taken as rectified"
     )
-    rig = as_rectified(rig_of_messages(left, right, where, rectified or other))
+    rig = as_rectified(rig_of_messages(left, right, where, rectified or other, between))
     return rig, note if other and not rectified else ""
+
+
+def _of_images(info: BagCameraInfo, size: tuple[int, int], where: StrPath) -> BagCameraInfo:
+    """Return the CameraInfo of images (width, height) that are a part of a sensor, or binned.
+
+    ``K`` and ``P`` are of all pixels of the sensor, of which a part is cut out, then binned.
+    """
+    stated, (x, y, *part) = (info.width_px, info.height_px), info.part
+    cut = np.array(part if all(part) else stated)
+    if size == stated or size != tuple(cut // info.binning):
+        return info
+    if x + cut[0] > stated[0] or y + cut[1] > stated[1]:
+        what, got = "region of interest is beyond the image", f"{cut[0]}x{cut[1]} at ({x}, {y})"
+        expected = f"within {stated[0]}x{stated[1]}"
+        raise CalibrationError(f"CameraInfo: {what}", where=where, got=got, expected=expected)
+    # The centre of a pixel is the middle of those that it is of.
+    to_cut = np.diag([*(1 / np.array(info.binning)), 1.0])
+    to_cut[:2, 2] = (0.5 - np.array([x, y])) / info.binning - 0.5
+    K, P = to_cut @ info.K, to_cut @ info.P
+    return info._replace(K=K, P=P, width_px=size[0], height_px=size[1])
 
 
 def choose_topics(
@@ -92,7 +119,7 @@ def choose_topics(
         if topic.kind in IMAGES and not topic.empty and "depth" not in topic.name.lower()
     ]
     ranked = sorted(
-        (not is_rectified(left), topics[left].kind == COMPRESSED, left, right)
+        (not is_rectified(left), topics[left].kind != IMAGE, left, right)
         for left, right in find_partners(images)
         if topics[left].kind == topics[right].kind
     )
@@ -108,7 +135,7 @@ def choose_topics(
 
 def info_topic(topics: Topics, image_topic: str) -> str | None:
     """Return the CameraInfo topic of an image topic: at the same level, or one level up."""
-    place = PurePosixPath(image_topic.removesuffix("/compressed")).parent
+    place = PurePosixPath(_TRANSPORT.sub("", image_topic)).parent
     for candidate in (place / "camera_info", place.parent / "camera_info"):
         topic = topics.get(str(candidate))
         if topic is not None and topic.kind == CAMERA_INFO and not topic.empty:
@@ -118,7 +145,7 @@ def info_topic(topics: Topics, image_topic: str) -> str | None:
 
 def is_rectified(image_topic: str) -> bool:
     """Return whether the name of a topic says that its images are rectified."""
-    return "rect" in image_topic.removesuffix("/compressed").rsplit("/", 1)[-1]
+    return "rect" in _TRANSPORT.sub("", image_topic).rsplit("/", 1)[-1]
 
 
 def _named(topics: Topics, settings: SourceSettings, where: StrPath) -> tuple[str, str]:
@@ -139,14 +166,25 @@ def _named(topics: Topics, settings: SourceSettings, where: StrPath) -> tuple[st
 
 
 def rig_of_messages(
-    left: BagCameraInfo, right: BagCameraInfo, where: StrPath, rectified: bool
+    left: BagCameraInfo,
+    right: BagCameraInfo,
+    where: StrPath,
+    rectified: bool,
+    between: Between = lambda: None,
 ) -> Rig:
-    """Return the rig of two CameraInfo messages; of rectified images only ``P`` is used."""
+    """Return the rig of two CameraInfo messages; of rectified images only ``P`` is used.
+
+    Where these have no baseline, cameras calibrated one by one, it is ``between`` their frames.
+    """
     for info in (left, right):
         if not info.P[0, 0] > 0 or not info.K[0, 0] > 0:
             what = "CameraInfo is of a camera that is not calibrated"
             got, hint = f"focal length {info.P[0, 0]:g} px", "name a calibration file with --calib"
             raise CalibrationError(what, where=where, got=got, hint=hint)
+    if np.array_equal(left.P[:, 3], right.P[:, 3]):
+        T_right_left = between()
+        if T_right_left is not None and T_right_left[:3, 3].any():
+            return _rig_between(left, right, where, rectified, T_right_left)
     if not rectified:
         cameras = [(_camera(info, where), info.R) for info in (left, right)]
         return rig_of_camera_infos(cameras[0], cameras[1], (left.P, right.P), where)
@@ -154,6 +192,20 @@ def rig_of_messages(
     named = {"P of the left": left.P, "P of the right": right.P}
     with reading(where):
         return projected_rig(named, left.width_px, left.height_px)
+
+
+def _rig_between(
+    left: BagCameraInfo, right: BagCameraInfo, where: StrPath, rectified: bool, T: Float64
+) -> StereoCalibration:
+    """Return the rig of cameras whose frames are known, ``T_right_left`` (4, 4)."""
+    sides = [left, right]
+    if rectified:  # each by itself
+        turns = [make_transform(one.R, np.zeros(3)) for one in sides]
+        T = orthonormalise(turns[1] @ T @ invert(turns[0]))
+        sides = [one._replace(K=one.P[:, :3], D=np.zeros(5), model="plumb_bob") for one in sides]
+    with reading(where):
+        check_side_by_side(T[:3, 3])
+        return StereoCalibration(_camera(sides[0], where), _camera(sides[1], where), T)
 
 
 def _camera(info: BagCameraInfo, where: StrPath) -> CameraIntrinsics:

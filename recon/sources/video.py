@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
@@ -26,6 +26,7 @@ from recon.sources.settings import SourceSettings
 from recon.sources.source import Recording, pair_frames
 
 _STACKED: Final = frozenset({"top-bottom", "bottom-top"})
+_ABOVE: Final = "the calibration fits views one above the other: the upper one is the left camera's"
 _LONGER: Final = 0.05  # fraction of a video without a partner: one camera was stopped later
 
 
@@ -97,6 +98,9 @@ def open_video_source(path: Path, settings: SourceSettings) -> VideoSource:
         rig, texts = read_rig(settings, home, size)
     except CalibrationError as error:
         hint = _how_to_cut(videos[0], settings, home) if len(videos) == 1 else None
+        above = settings.model_copy(update={"side_by_side": "top-bottom"})
+        if settings.side_by_side == "left-right" and hint and hint.endswith("top-bottom"):
+            return replace(open_video_source(path, above), notes=(_ABOVE,))
         raise error.copy_with(hint=hint or error.hint) from error
     rate_hz = settings.rate_hz or videos[0].rate_hz
     layout = "two videos" if len(videos) == 2 else f"{settings.side_by_side} in one video"

@@ -142,8 +142,8 @@ def step_between(projections: tuple[Float64, Float64], where: StrPath) -> Float6
         where=where,
         got=f"P[0, 3] = {right:g}" + (f", {left:g} of the left" if left else ""),
         expected="-fx * baseline, below that of the left",
-        hint="the right camera was calibrated alone: calibrate both as a pair, or name a "
-        "calibration file with --calib",
+        hint="the right camera was calibrated alone, and no static transform is between both: "
+        "calibrate both as a pair, or name a calibration file with --calib",
     )
 
 

@@ -97,11 +97,6 @@ def eight_bits(values: NDArray[Any], levels: Levels) -> UInt8:
     return scaled
 
 
-def beyond(values: NDArray[Any], levels: Levels) -> float:
-    """Return the fraction of pixels that are darker than black, or brighter than white."""
-    return float(((values < levels.black) | (values > levels.white)).mean())
-
-
 def find_levels(images: Iterable[NDArray[Any]]) -> Levels:
     """Return the levels for images, uint8 or uint16, of a sensor of 8 to 16 bits.
 
@@ -112,13 +107,9 @@ def find_levels(images: Iterable[NDArray[Any]]) -> Levels:
     counts = np.zeros(1 << 16, np.int64)
     for image in images:
         counts += np.bincount(image.ravel(), minlength=counts.size)
-    if not counts.any():
-        return Levels(0, counts.size - 1)
-    brightest = int(np.flatnonzero(counts).max())
-    white = 2 ** max(8, brightest.bit_length()) - 1
-    total = np.cumsum(counts)
-    ends = np.array([_OUTLIERS, 1 - _OUTLIERS]) * total[-1]
-    low, high = np.searchsorted(total, ends).tolist()
+    white = 2 ** max(8, int(np.flatnonzero(counts).max(initial=0)).bit_length()) - 1
+    below = np.cumsum(counts)
+    low, high = np.searchsorted(below, below[-1] * np.array([_OUTLIERS, 1 - _OUTLIERS])).tolist()
     if high - low >= white / 4:
         return Levels(0, white)
     span = max(255, round((high - low) * (1 + 2 * _ROOM)))
@@ -127,25 +118,26 @@ def find_levels(images: Iterable[NDArray[Any]]) -> Levels:
 
 
 @reader
-def read_levels(path: StrPath, max_megapixels: float = MAX_MEGAPIXELS) -> NDArray[Any]:
-    """Read an image as stored, such as a mask: uint8 or uint16, (H, W) or (H, W, 3) RGB."""
+def read_levels(
+    path: StrPath, max_megapixels: float = MAX_MEGAPIXELS, *, turned: bool = False
+) -> NDArray[Any]:
+    """Read an image as stored, such as a mask: uint8 or uint16, (H, W) or (H, W, 3) RGB.
+
+    ``turned`` = as its EXIF orientation says that it is to be seen.
+    """
     content = read_bytes(path, int(max_megapixels * 1e6 * _PIXEL_BYTES) + SMALL_FILE_BYTES)
-    return _decode(content, max_megapixels)
+    return _decode(content, max_megapixels, turned=turned)
 
 
 def decode_levels(content: bytes, encoding: str, where: StrPath) -> NDArray[Any]:
-    """Read an image like `read_levels`, from bytes in memory.
-
-    Where it is grey and ``encoding``, of ROS, is a Bayer pattern, colours are made of it.
-    """
+    """Read an image like `read_levels`, from memory; colours are made of a Bayer pattern."""
     with reading(where):
         values, name = _decode(content, MAX_MEGAPIXELS), encoding.lower()
-    grey = values.ndim == 2 and name.startswith("bayer_")
-    code = _ENCODINGS.get(name, (0, 0, None))[2] if grey else None
-    return values if code is None else np.asarray(cv2.cvtColor(values, code))
+    code = _ENCODINGS[name][2] if name.startswith("bayer_") and name in _ENCODINGS else None
+    return values if code is None or values.ndim > 2 else np.asarray(cv2.cvtColor(values, code))
 
 
-def _decode(content: bytes, max_megapixels: float) -> NDArray[Any]:
+def _decode(content: bytes, max_megapixels: float, *, turned: bool = False) -> NDArray[Any]:
     size = stated_size(content)
     # A small file can hold very many pixels.
     if size is not None and size[0] * size[1] > max_megapixels * 1e6:
@@ -155,7 +147,8 @@ def _decode(content: bytes, max_megapixels: float) -> NDArray[Any]:
     check_image_bytes(content)
     try:
         with silent_opencv() if content.startswith(_TIFF_STARTS) else nullcontext():
-            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+            how = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR if turned else cv2.IMREAD_UNCHANGED
+            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), how)
     except cv2.error as error:
         raise FormatError("image cannot be decoded", got=error.err) from error
     if image is None:
@@ -248,17 +241,14 @@ def pixels_of_ros_image(
         raise FormatError(what, where=where, got=encoding, expected=expected)
     height_px, width_px = shape
     channels, bits, to_rgb = _ENCODINGS[name]
-    row, rows = width_px * channels * bits // 8, height_px
+    row, rows, odd = width_px * channels * bits // 8, height_px, False
     if name in _PLANES:
-        rows = height_px * 3 // 2
-        step = width_px if data.size == rows * width_px else step  # some write bytes of a pixel
-        if height_px % 2 or width_px % 2:
-            got, what = f"{width_px}x{height_px} pixels of {name}", "image has an odd size"
-            raise FormatError(what, where=where, got=got, expected="even numbers of pixels")
-    if step < row or data.size < step * (rows - 1) + row or min(shape) < 1:
+        rows, odd = height_px * 3 // 2, bool(height_px % 2 or width_px % 2)
+        step = row if data.size == rows * row else step  # some count bytes of both planes
+    if odd or step < row or data.size < step * (rows - 1) + row or min(shape) < 1:
         got = f"{counted(data.size, 'byte')}, {step} per row"
         expected = f"{width_px}x{height_px} pixels of {name}"
-        what = "image message has too few bytes"
+        what = "image has an odd size" if odd else "image message has too few bytes"
         raise FormatError(what, where=where, got=got, expected=expected)
     pixels = np.ascontiguousarray(np.lib.stride_tricks.as_strided(data, (rows, row), (step, 1)))
     if bits == 16:
@@ -278,6 +268,7 @@ _READERS: Final[dict[bytes, type[ImageFile]]] = {
     b"\x89PNG": PngImageFile, b"\xff\xd8": JpegImageFile, b"BM": BmpImageFile, b"P": PpmImageFile,
 }  # fmt: skip
 _TIFF_WIDTH, _TIFF_HEIGHT, _EXIF_IFD = 256, 257, 0x8769
+_ORIENTATION: Final = 0x0112
 _SENSOR_UNIT: Final = 0xA210
 #: Focal length, its 35 mm equivalent, pixels of the sensor per unit, width of the recorded image.
 _EXIF_NUMBERS: Final = (0x920A, 0xA405, 0xA20E, 0xA002)
@@ -413,6 +404,16 @@ def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal
         focal_px = equivalent_mm * math.hypot(width_px, height_px) / _DIAGONAL_35MM
         return ExifFocal(focal_px, f"{equivalent_mm:g} mm as 35 mm equivalent")
     return None
+
+
+def read_orientation(path: StrPath) -> int:
+    """Return the EXIF orientation of a JPEG, 1 to 8; 1 = as stored, also where none is known."""
+    try:
+        with _silent_pillow(), reading(path), Image.open(path, formats=("JPEG",)) as image:
+            found = image.getexif().get(_ORIENTATION, 1)
+    except FormatError:
+        return 1
+    return found if found in range(1, 9) else 1
 
 
 def _number(value: Any) -> float | None:

@@ -8,12 +8,22 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.core.errors import FormatError
 from recon.core.values.arrays import Float64
 from recon.io.images.image import decode_levels, pixels_of_ros_image
+from recon.io.images.packets import codec_of
 from recon.io.ros.messages import NS_PER_S
 
 IMAGE: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
+VIDEO: Final = "foxglove_msgs/msg/CompressedVideo"
+PACKET: Final = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
+#: Fields of messages with a frame of a video each, which rosbags does not bring.
+VIDEOS: Final = {
+    VIDEO: "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format",
+    PACKET: "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\n"
+    "uint8 flags\nbool is_bigendian\nuint8[] data",
+}
 CAMERA_INFO: Final = "sensor_msgs/msg/CameraInfo"
 FIX: Final = "sensor_msgs/msg/NavSatFix"
 IMU: Final = "sensor_msgs/msg/Imu"
@@ -37,6 +47,8 @@ class BagCameraInfo(NamedTuple):
     K: Float64
     R: Float64
     P: Float64
+    binning: tuple[int, int] = (1, 1)  # columns and rows of the sensor in a pixel
+    part: tuple[int, int, int, int] = (0, 0, 0, 0)  # of the sensor: x, y, width, height; 0 = all
 
 
 class BagPose(NamedTuple):
@@ -60,6 +72,9 @@ def levels_of(message: Any, where: str) -> NDArray[Any]:
     if hasattr(message, "format"):
         # Such as "bayer_rggb8; jpeg compressed": what was compressed, and how.
         encoding = str(message.format).partition(";")[0].strip()
+        if codec_of(encoding) is not None:
+            what, hint = "videos are not read while they arrive", "record a bag of them"
+            raise FormatError(what, where=where, got=encoding, hint=hint)
         return decode_levels(message.data.tobytes(), encoding, where)
     shape, big_endian = (message.height, message.width), bool(message.is_bigendian)
     how = message.encoding, shape, message.step
@@ -71,7 +86,10 @@ def camera_info_of(message: Any) -> BagCameraInfo:
     names = "DKRP" if hasattr(message, "K") else "dkrp"
     D, K, R, P = (np.array(getattr(message, name), np.float64) for name in names)
     size, model = (int(message.width), int(message.height)), str(message.distortion_model)
-    return BagCameraInfo(*size, model, D, K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4))
+    matrices, roi = (K.reshape(3, 3), R.reshape(3, 3), P.reshape(3, 4)), message.roi
+    binning = max(1, int(message.binning_x)), max(1, int(message.binning_y))  # 0 = 1
+    part = int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)
+    return BagCameraInfo(*size, model, D, *matrices, binning, part)
 
 
 def poses_of(message: Any, recorded_ns: int) -> Iterator[BagPose]:
