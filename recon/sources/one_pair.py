@@ -23,6 +23,7 @@ from recon.io.images.image import (
     find_levels,
     read_focal_length,
     read_levels,
+    read_orientation,
 )
 from recon.io.middlebury import read_middlebury_scene, stand_in_camera
 from recon.sources.calibration import CALIBRATE, camera_of_numbers, check_given_once, read_rig
@@ -133,8 +134,9 @@ def read_pair_input(
         rig = read_calibration(calibration, *size, metres_per_unit=unit_m, cameras=cameras)
         return PairInput(pair, rig, (left, right, calibration))
 
-    given, turn = open_fitting(read, settings or known or SourceSettings(), lambda _: left)
-    check_orientation(right, turn.get("orientation"))
+    settings = settings or known or SourceSettings()
+    check_orientation(right, None if settings.orientation else read_orientation(left))
+    given, turn = open_fitting(read, settings, lambda _: left)
     given = replace(given, notes=turn.get("notes", ()))
     return given if known is None or calibration is not None else _with_camera(given, known)
 

@@ -114,12 +114,15 @@ class Recorder:
     def transforms(self, *parts: Any) -> Any:
         return self.make("tf2_msgs/TFMessage", transforms=list(parts))
 
-    def camera_infos(self, stamp_ns, camera, topics=TOPICS, size=None, **others):
+    def camera_infos(
+        self, stamp_ns, camera, topics=TOPICS, size=None, *,
+        binning=(0, 0), part=(0, 0, 0, 0), **others,
+    ):  # fmt: skip
         """Write CameraInfo of rectified images; ``others`` than its fields, and another size."""
         width_px, height_px = size or (camera.width_px, camera.height_px)
         roi = self.make(
             "sensor_msgs/RegionOfInterest",
-            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
+            x_offset=part[0], y_offset=part[1], width=part[2], height=part[3], do_rectify=False,
         )  # fmt: skip
         for topic, P in zip(topics, projections(camera), strict=True):
             K = P[:, :3].ravel().copy()
@@ -127,8 +130,9 @@ class Recorder:
             named |= {name: np.array(value, np.float64) for name, value in others.items()}
             info = self.make(
                 "sensor_msgs/CameraInfo", header=self.header(stamp_ns), height=height_px,
-                width=width_px, distortion_model="plumb_bob", binning_x=0, binning_y=0,
-                roi=roi, **{k if self.ros1 else k.lower(): v for k, v in named.items()},
+                width=width_px, distortion_model="plumb_bob", binning_x=binning[0],
+                binning_y=binning[1], roi=roi,
+                **{k if self.ros1 else k.lower(): v for k, v in named.items()},
             )  # fmt: skip
             place = topic.removesuffix("/compressed").rsplit("/", 1)[0]
             self.write(f"{place}/camera_info", stamp_ns, info)

@@ -332,7 +332,7 @@ def test_a_video_that_cannot_be_halved_is_reported():
 
 @pytest.mark.parametrize(
     ("layout", "stack", "hint"),
-    [("left-right", np.vstack, "fits it cut so: --set source.side_by_side=top-bottom"),
+    [("right-left", np.vstack, "fits it cut so: --set source.side_by_side=top-bottom"),
      ("top-bottom", np.hstack, "fits it cut so: --set source.side_by_side=left-right"),
      ("left-right", lambda views: views[0], "it shows one camera: name .* --right"),
      ("left-right", lambda views: np.tile(views[0], (3, 3)), "use images as they were calibrated")],
@@ -358,6 +358,10 @@ def test_views_may_stand_in_any_order_in_one_video(noise, tmp_path, layout, flip
     path = drives.write_video(tmp_path / "both.avi", [stack(both) for both in images])
     source = open_source(path, settings=SourceSettings(side_by_side=layout))  # type: ignore[arg-type]
     assert source.description.startswith(f"{layout} in one video, 10 Hz")
+    if layout == "top-bottom":  # which the calibration says, too
+        source = open_source(path)
+        assert source.description.startswith("top-bottom in one video, 10 Hz")
+        assert "one above the other: the upper one is the left" in source.warnings()[0]
     read = list(source)
     np.testing.assert_array_equal(read[3].left[:, :, 0], noise[3].left)
     np.testing.assert_array_equal(read[3].right[:, :, 0], noise[3].right)

@@ -48,5 +48,5 @@ def decode_packets(
                 break
     except av.FFmpegError as error:
         got = error.strerror
-    what, hint = "frame of a video cannot be decoded", "record it whole, and without B-frames"
+    what, hint = "frame of a video cannot be decoded", "copy the recording again, or end before it"
     raise FormatError(what, where=f"{where}, message {wanted[done]}", got=got, hint=hint)

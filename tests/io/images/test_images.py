@@ -289,11 +289,11 @@ def test_a_bayer_image_of_one_colour_gives_that_colour(pattern):
 
 
 @pytest.mark.parametrize("big_endian", [False, True])
-def test_sixteen_bits_of_a_message_are_scaled_in_either_order_of_bytes(big_endian):
+def test_sixteen_bits_of_a_message_are_read_in_either_order_of_bytes(big_endian):
     values = np.array([[0, 257, 65535]], ">u2" if big_endian else "<u2")
     data = np.frombuffer(values.tobytes(), np.uint8)
     image = pixels_of_ros_image(data, "mono16", (1, 3), 6, big_endian=big_endian)
-    np.testing.assert_array_equal(image, [[0, 1, 255]])
+    np.testing.assert_array_equal(image, [[0, 257, 65535]])
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("yuv422_yuy2", "yuyv"), ("yuv422", "uyvy")])
