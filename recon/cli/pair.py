@@ -13,6 +13,7 @@ from recon.core.errors import SettingsError
 
 if TYPE_CHECKING:
     from recon.commands.config import ReconConfig
+    from recon.sources.settings import SourceSettings
 
 
 def _settings(shared: opt.Shared, ndisp: int | None) -> ReconConfig:
@@ -27,6 +28,12 @@ def _settings(shared: opt.Shared, ndisp: int | None) -> ReconConfig:
         what, got = "the matcher has no such setting", f"matcher {name_of(used)!r}"
         raise SettingsError(what, where="--ndisp", got=got)
     return settings
+
+
+def _readable(settings: ReconConfig, unit_m: float | None = None) -> SourceSettings:
+    unit_m = unit_m or settings.source.metres_per_unit
+    update = {"metres_per_unit": unit_m, "max_megapixels": settings.readable_megapixels}
+    return settings.source.model_copy(update=update)
 
 
 Left = Annotated[Path, typer.Argument(help="Left image.")]
@@ -88,13 +95,12 @@ def pair(
         from recon.sources.one_pair import read_pair_input, with_truth
 
         settings = _settings(shared, ndisp)
-        unit = {} if unit_m is None else {"metres_per_unit": unit_m}
         given = read_pair_input(
             left,
             right,
             calib,
             known=settings.source,
-            settings=settings.readable.model_copy(update=unit),
+            settings=_readable(settings, unit_m),
         )
         run = run_pair(
             with_truth(given, truth),
@@ -135,7 +141,7 @@ def disparity(
             left,
             right,
             calib,
-            settings=settings.readable,
+            settings=_readable(settings),
         )
         run = run_disparity(given, settings, out=out, threads=shared.threads)
     shared.show(run.summary)

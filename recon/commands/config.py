@@ -70,11 +70,10 @@ class ReconConfig(DriveSettings, AuditedSettings, CalibratedSettings):
         return self
 
     @property
-    def readable(self) -> SourceSettings:
-        """The settings of the source, whose largest image is small enough for the memory limit."""
+    def readable_megapixels(self) -> float:
+        """Largest image to read, in 10⁶ pixels: as set, and small enough for the memory limit."""
         limit_mb, most = self.memory.limit_mb, self.source.max_megapixels
-        most = most if limit_mb is None else min(most, limit_mb / _BYTES_PER_PIXEL)
-        return self.source.model_copy(update={"max_megapixels": most})
+        return most if limit_mb is None else min(most, limit_mb / _BYTES_PER_PIXEL)
 
     def recorded(self, command: str) -> dict[str, Any]:
         """Return the groups that determine the result of a command.

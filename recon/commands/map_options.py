@@ -136,10 +136,11 @@ class MapOptions:
         """Open the source; return it, and the options with the poses and the prior read."""
         if self.source is None:
             raise SettingsError("there is no source to map", hint="name SOURCE")
-        source = open_source(self.source, self.kind, config.readable)
+        settings = config.source.model_copy(update={"max_megapixels": config.readable_megapixels})
+        source = open_source(self.source, self.kind, settings)
         prior = None if self.prior_from is None else source.read_prior(self.prior_from)
         poses = None if self.poses_file is None else read_trajectory(self.poses_file)
-        if poses is not None and config.source.poses_of == "raw":
+        if poses is not None and settings.poses_of == "raw":
             R_rectified_raw = turns_of(source.calibration, config.rectification).R_left
             T_raw_rectified = make_transform(R_rectified_raw.T, np.zeros(3))
             poses = replace(poses, T_world_camera=poses.T_world_camera @ T_raw_rectified)

@@ -315,15 +315,13 @@ class Ros2Source(StereoSource):
     def _eight_bits(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[UInt8, UInt8]:
         """Scale 16 bits by the first pair, and by more where much of a later one is beyond it."""
         known, deep = self._levels, [one for one in (left, right) if one.dtype != np.uint8]
-        if deep and (known is None or max(_beyond(one, known) for one in deep) > _CLIPPED):
+        if known is None or any((np.clip(one, *known) != one).mean() > _CLIPPED for one in deep):
             found = find_levels(deep)
             if known is not None:
-                found = Levels(min(known.black, found.black), max(known.white, found.white))
-                LOGGER.warning("16-bit images: %d to %d are black to white now, not %d to %d",
-                               *found, *known)  # fmt: skip
-            self._levels = found
-        levels = self._levels or Levels(0, 255)
-        return eight_bits(left, levels), eight_bits(right, levels)
+                found = Levels(min(found.black, known.black), max(found.white, known.white))
+                LOGGER.warning("16-bit images: %d is black from now on, %d white", *found)
+            self._levels = known = found
+        return eight_bits(left, known), eight_bits(right, known)
 
     @contextmanager
     def _refusing(self) -> Iterator[None]:
@@ -338,10 +336,6 @@ class Ros2Source(StereoSource):
         if fault not in self._refused:
             LOGGER.warning("%s; not used", error)
         self._refused[fault] += 1
-
-
-def _beyond(values: NDArray[Any], levels: Levels) -> float:
-    return float(((values < levels.black) | (values > levels.white)).mean())
 
 
 def _matrix(pose: BagPose, where: str) -> Float64:

@@ -58,10 +58,7 @@ class Bag:
         self.topics = self._find_topics()
 
     def scan(self, topics: Sequence[str]) -> dict[str, NDArray[np.int64]]:
-        """Return of each topic int64 (N, 2), ns: time of recording, in order, and header stamp.
-
-        Of a video it begins with the first message from which it can be decoded.
-        """
+        """Return of each topic int64 (N, 2), ns: time of recording, in order, and header stamp."""
         times: dict[str, list[tuple[int, int]]] = {topic: [] for topic in topics}
         for topic, recorded_ns, content in self._messages(topics):
             if topic not in self._codecs or self._codecs[topic]:

@@ -88,10 +88,7 @@ def rig_of_infos(
 
 
 def _of_images(info: BagCameraInfo, size: tuple[int, int], where: StrPath) -> BagCameraInfo:
-    """Return the CameraInfo of images (width, height) that are a part of a sensor, or binned.
-
-    ``K`` and ``P`` are of all pixels of the sensor, of which a part is cut out, then binned.
-    """
+    """Return the CameraInfo of images of which a part of the sensor is cut out, then binned."""
     stated, (x, y, *part) = (info.width_px, info.height_px), info.part
     cut = np.array(part if all(part) else stated)
     if size == stated or size != tuple(cut // info.binning):
@@ -172,10 +169,7 @@ def rig_of_messages(
     rectified: bool,
     between: Between = lambda: None,
 ) -> Rig:
-    """Return the rig of two CameraInfo messages; of rectified images only ``P`` is used.
-
-    Where these have no baseline, cameras calibrated one by one, it is ``between`` their frames.
-    """
+    """Return the rig of CameraInfo, of rectified images by ``P`` alone, else by ``between``."""
     for info in (left, right):
         if not info.P[0, 0] > 0 or not info.K[0, 0] > 0:
             what = "CameraInfo is of a camera that is not calibrated"

@@ -332,3 +332,49 @@ def source_until(source, number):
         yield pair
         if round(1e9 * pair.timestamp_s) >= BEGIN_NS + number * PERIOD_NS:
             return
+
+
+class Thermal(Robot):
+    """Cameras of 14 bits, calibrated one by one; the scene gets brighter by 2000 values."""
+
+    def messages(self, number, at_ns):
+        T = make_transform(np.eye(3), np.array([0.2, 0.0, 0.0]))
+        yield "/tf_static", transforms(at_ns, [("left", "right", T)])
+        for side, name in enumerate(("left", "right")):
+            values = (thermal() + 2000 * (number > 60) + side).astype("<u2")
+            kind, image = image_message(thermal(), name, at_ns, compressed=False)
+            data = np.frombuffer(values.tobytes(), np.uint8)
+            yield (
+                f"/{name}/image_raw",
+                (kind, image | {"encoding": "16UC1", "step": 128, "data": data}),
+            )
+            _, content = info(0, at_ns)
+            yield f"/{name}/camera_info", ("sensor_msgs/msg/CameraInfo", content)
+
+
+def thermal():
+    return 7300 + np.arange(32 * 64).reshape(32, 64) // 4
+
+
+def test_levels_of_deep_images_stay_until_a_scene_is_beyond_them_and_transforms_give_the_baseline(
+    caplog,
+):
+    robot = Thermal()
+    robot.start()
+    try:
+        with caplog.at_level(logging.WARNING), open_ros2("ros2:", SourceSettings()) as source:
+            assert source.calibration.baseline_m == pytest.approx(0.2)
+            spans, numbers = [], []
+            for pair in source.frames():
+                numbers.append((source.stamp_ns(pair.timestamp_s) - BEGIN_NS) // PERIOD_NS)
+                spans.append(np.ptp(pair.left.astype(int)))
+                if numbers[-1] > 66:
+                    break
+    finally:
+        robot.over.set()
+        robot.join()
+    before = {span for span, number in zip(spans, numbers, strict=True) if number <= 60}
+    assert len(before) == 1
+    assert 190 < before.pop() < 230  # of 512 values, with room
+    assert 0 < spans[-1] < 60  # both scenes are within them now
+    assert sum("16-bit images" in one for one in caplog.messages) == 1

@@ -1,1 +1,1 @@
-"""Images and disparity maps."""
+"""Images, frames of videos in messages (`packets.py`), and disparity maps."""

@@ -72,19 +72,19 @@ class Levels(NamedTuple):
 
 
 def read_image(
-    path: StrPath, levels: Levels | None = None, max_megapixels: float = MAX_MEGAPIXELS
+    path: StrPath, white: int | None = None, max_megapixels: float = MAX_MEGAPIXELS
 ) -> UInt8:
     """Read PNG, JPEG, PGM, PPM, BMP or TIFF: uint8 (H, W) if it is grey, else (H, W, 3) RGB.
 
-    16 bits are scaled to 8 by ``levels``, None = those of this image (`find_levels`). Alpha is
-    dropped; the EXIF orientation is ignored: pixels are as the sensor recorded them.
+    16 bits are scaled to 8: ``white`` becomes 255, None = by what the image has (`find_levels`).
+    Alpha is dropped; the EXIF orientation is ignored: pixels are as the sensor recorded them.
 
     Raises:
         FormatError: The file is missing, truncated, not an image, has more than ``max_megapixels``
             (10⁶ pixels), or floating-point pixels.
     """
     values = read_levels(path, max_megapixels)
-    return eight_bits(values, levels or find_levels([values]))
+    return eight_bits(values, find_levels([values]) if white is None else Levels(0, white))
 
 
 def eight_bits(values: NDArray[Any], levels: Levels) -> UInt8:
@@ -121,10 +121,7 @@ def find_levels(images: Iterable[NDArray[Any]]) -> Levels:
 def read_levels(
     path: StrPath, max_megapixels: float = MAX_MEGAPIXELS, *, turned: bool = False
 ) -> NDArray[Any]:
-    """Read an image as stored, such as a mask: uint8 or uint16, (H, W) or (H, W, 3) RGB.
-
-    ``turned`` = as its EXIF orientation says that it is to be seen.
-    """
+    """Read uint8 or uint16, (H, W) or (H, W, 3) RGB, as stored, or ``turned`` as EXIF data say."""
     content = read_bytes(path, int(max_megapixels * 1e6 * _PIXEL_BYTES) + SMALL_FILE_BYTES)
     return _decode(content, max_megapixels, turned=turned)
 

@@ -1,7 +1,4 @@
-"""Frames of H.264 and H.265 that are cut into messages, decoded by PyAV (extra ``video``).
-
-Ref: ITU-T H.264 and H.265, 7.3.1 and annex B.
-"""
+"""Frames of H.264 and H.265 (ITU-T, 7.3.1, annex B) in messages, decoded by PyAV."""
 
 from __future__ import annotations
 
