@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -118,14 +118,14 @@ def open_bag(path: Path, settings: SourceSettings) -> BagSource:
     pairs, listing = pair_frames(frames, settings, path)
     recorded_ns = (times[topics[0]][:, 0], times[topics[1]][:, 0])
     first = next(bag.images(topics[0], [pairs[0][0]], recorded_ns[0]))
-    size, note = (first.shape[1], first.shape[0]), ""
+    size, note, texts = (first.shape[1], first.shape[0]), "", tuple[Path, ...]()
     if settings.has_camera:
         rig, texts = read_rig(settings, path, size)
         source = f"calibration {settings.calibration or 'in numbers'}"
     else:
-        infos = [bag.camera_info(name) for name in info_topics(bag.topics, topics, path)]
-        between = partial(_between, bag, topics)
-        (rig, note), texts = rig_of_infos(infos[0], infos[1], topics, path, size, between), ()
+        left, right = [bag.camera_info(name) for name in info_topics(bag.topics, topics, path)]
+        rig, note = rig_of_infos(left, right, topics, path, size, lambda: static_transform(
+            _static_edges(bag), bag.frame_id(topics[1]), bag.frame_id(topics[0])))  # fmt: skip
         source = "its CameraInfo" + (f" ({note})" if note else "")
     also += _list_others(bag, topics)
     lost = [f"{name}: {counted(count, 'image')} before the first keyframe of the video: left out"
@@ -327,13 +327,6 @@ def _root_above(base: str, edges: Sequence[BagPose]) -> str:
 def _static_edges(bag: Bag) -> list[BagPose]:
     topics = [t.name for t in bag.topics.values() if t.kind in TRANSFORMS and _STATIC in t.name]
     return [pose for topic in topics for pose in bag.poses(topic)]
-
-
-def _between(bag: Bag, topics: tuple[str, str]) -> Float64 | None:
-    """Return T_right_left (4, 4) of images by the static transforms; None = unknown."""
-    left, right = map(bag.frame_id, topics)
-    with reading(bag.paths[0]):
-        return static_transform(_static_edges(bag), right, left)
 
 
 def read_measured(path: Path) -> Positions:

@@ -194,8 +194,8 @@ def _rig_between(
     """Return the rig of cameras whose frames are known, ``T_right_left`` (4, 4)."""
     sides = [left, right]
     if rectified:  # each by itself
-        turns = [make_transform(one.R, np.zeros(3)) for one in sides]
-        T = orthonormalise(turns[1] @ T @ invert(turns[0]))
+        left_turn, right_turn = (make_transform(one.R, np.zeros(3)) for one in sides)
+        T = orthonormalise(right_turn @ T @ invert(left_turn))
         sides = [one._replace(K=one.P[:, :3], D=np.zeros(5), model="plumb_bob") for one in sides]
     with reading(where):
         check_side_by_side(T[:3, 3])

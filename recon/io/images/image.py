@@ -98,11 +98,10 @@ def eight_bits(values: NDArray[Any], levels: Levels) -> UInt8:
 
 
 def find_levels(images: Iterable[NDArray[Any]]) -> Levels:
-    """Return the levels for images, uint8 or uint16, of a sensor of 8 to 16 bits.
+    """Return the levels for images of a sensor: all that it can give, by the brightest value.
 
-    They are all that it can give, 0 to 2^n - 1 by the brightest value. Where nearly all pixels
-    take less than a quarter of that, as in thermal images and at night, they are what these take,
-    but no finer than what the sensor tells apart.
+    Where nearly all pixels take less than a quarter of that, as in thermal images and at night,
+    they are what these take, but no finer than what the sensor tells apart.
     """
     counts = np.zeros(1 << 16, np.int64)
     for image in images:
