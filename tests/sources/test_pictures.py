@@ -22,6 +22,7 @@ from recon.look.sample import measure_mosaic
 from recon.sources.one_pair import read_pair_input
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
+from recon.stereo.frame import FrameReconstructor, StereoSettings
 from tests.sources import drives
 from tests.sources.bags import TOPICS, Recording, recorder
 from tests.sources.drives import CAMERA
@@ -431,3 +432,31 @@ def test_damaged_exif_data_say_nothing(tmp_path):
         file.write_bytes(bytes(content))
     source = open_source(path)
     assert (len(list(source)), source.warnings()) == (2, [])
+
+
+@pytest.mark.slow
+@pytest.mark.real
+def test_a_road_is_matched_as_well_from_a_bag_of_twelve_or_fourteen_bits(recon_data, tmp_path):
+    drive = open_source(recon_data / "driven" / "kitti_06_51", settings=SourceSettings(end=1))
+    (pair,), found = drive, []
+    plain = FrameReconstructor(drive.calibration, StereoSettings()).match(pair)[1].values
+    for name, make, scale in (
+        ("12", sixteen(), (16, 9)),
+        ("14", sixteen("16UC1"), (2, 7300)),
+        ("mosaic", compressed("bayer_rggb8; jpeg compressed ", ".jpg"), None),
+    ):
+        folder = tmp_path / name
+        with recorder(folder, Recording("mcap")) as bag:
+            bag.camera_infos(START_NS, drive.calibration)
+            for topic, image in zip(TOPICS, (pair.left, pair.right), strict=True):
+                grey = image if image.ndim == 2 else image[:, :, 0]
+                values = mosaic(grey) if scale is None else grey.astype(np.uint16) * scale[0]
+                values = values if scale is None else values + scale[1]
+                bag.write(topic, START_NS, make(bag, START_NS, values))
+        source = open_source(Recording("mcap").path(folder))
+        (read,) = source
+        values = FrameReconstructor(source.calibration, StereoSettings()).match(read)[1].values
+        found.append(np.isfinite(values).mean() / np.isfinite(plain).mean())
+    # The same pixels; of the mosaic half of the light is missing.
+    assert min(found[:2]) > 0.98
+    assert found[2] > 0.9
