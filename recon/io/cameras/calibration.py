@@ -14,6 +14,7 @@ from recon.core.errors import CalibrationError, FormatError
 from recon.core.geometry.se3 import make_transform
 from recon.core.text import parse_number
 from recon.core.values import (
+    LENS_COEFFICIENTS,
     CameraIntrinsics,
     LensModel,
     RectifiedCamera,
@@ -36,12 +37,6 @@ _HEADER: Final = """\
 # Pixel centres are at integers; camera axes: x right, y down, z forward.
 # xyz_right = rotation * xyz_left + translation_m
 """
-_NAMES: Final[dict[str, tuple[str, ...]]] = {  # of coefficients, by lens model
-    "pinhole": (
-        "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty",
-    ),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-}  # fmt: skip
 _RECTIFIED: Final = ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m")
 
 
@@ -104,16 +99,16 @@ def _camera_content(camera: CameraIntrinsics) -> dict[str, Any]:
         "width_px": camera.width_px,
         "height_px": camera.height_px,
         **{name: float(value) for name, value in pinhole.items()},
-        "distortion": dict(zip(_NAMES[camera.model], camera.distortion.tolist(), strict=False)),
+        "distortion": dict(zip(LENS_COEFFICIENTS[camera.model], camera.distortion.tolist(), strict=False)),
     }
 
 
 def _read_camera(fields: Fields) -> CameraIntrinsics:
     model = cast("LensModel", fields.text("model"))
-    if model not in _NAMES:
-        raise FormatError("unknown lens model", got=model, expected="pinhole or fisheye")
+    if model not in LENS_COEFFICIENTS:
+        raise FormatError("unknown lens model", got=model, expected=", ".join(LENS_COEFFICIENTS))
     fx, fy, cx, cy = (fields.number(name) for name in ("fx_px", "fy_px", "cx_px", "cy_px"))
-    given, names = fields.below("distortion"), _NAMES[model]
+    given, names = fields.below("distortion"), LENS_COEFFICIENTS[model]
     known = [name for name in names if name in given]
     if known != list(names[: len(known)]):
         raise FormatError("distortion has gaps", got=", ".join(known), expected=", ".join(names))
