@@ -12,8 +12,8 @@ from recon.core.errors import CalibrationError, FormatError, ReconError, ShapeEr
 from recon.core.geometry.se3 import make_transform
 from recon.core.values import FREE, CameraIntrinsics, OccupancyGrid, StereoCalibration
 from recon.io.cameras.calibration import read_calibration, write_recon_calibration
+from recon.io.cameras.contents import read_contents
 from recon.io.cameras.kitti import read_kitti_calib
-from recon.io.cameras.opencv_yaml import read_file_storage
 from recon.io.cameras.ros import read_euroc_truth, write_kalibr
 from recon.io.fields import read_toml, read_yaml
 from recon.io.files import read_table, read_text
@@ -52,7 +52,7 @@ CORPUS: dict[str, tuple[Callable[[Path], object], list[Row]]] = {
         [(b"a: [1\nb: 2\n", ":2: not a YAML file"), (b"- 1\n", r"not a mapping \(got list\)")],
     ),
     "stereo.yml": (
-        read_file_storage,
+        read_contents,
         [
             (b"%YAML:1.0\n---\nM1: [1,2\n", "not a YAML file"),
             (b"hello", ": not an OpenCV FileStorage"),

@@ -79,7 +79,8 @@ class CameraIntrinsics:
         if self.model != "pinhole" and self.distortion.size != len(names):
             what = f"the lens model {self.model} has other coefficients"
             raise CalibrationError(what, got=self.distortion.size, expected=" ".join(names))
-        for name, value, (least, most) in zip(names, self.distortion, _WITHIN.get(self.model, ())):
+        limits = _WITHIN.get(self.model, ())
+        for name, value, (least, most) in zip(names, self.distortion, limits, strict=False):
             if not least <= value <= most:
                 what = f"{name} of the lens model {self.model} is implausible"
                 raise CalibrationError(what, got=f"{value:g}", expected=f"{least:g} to {most:g}")

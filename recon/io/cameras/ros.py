@@ -50,7 +50,7 @@ _EUROC_MODELS: Final[Models] = {
     "equidistant": ("fisheye", (4,)),
 }
 NS: Final = 1e-9
-_AGAIN: Final = "calibrate again with one of these; equidistant is for wide lenses"
+AGAIN: Final = "calibrate again with one of these; equidistant is for wide lenses"
 _SIDES: Final = ("left", "right")
 _OFF_CENTRE: Final = 0.05  # of a principal point, in image sizes: hardly a lens is mounted worse
 
@@ -198,22 +198,6 @@ def _matrix(values: NDArray[Any]) -> dict[str, Any]:
     return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
 
 
-@reader
-def read_kalibr(path: StrPath) -> StereoCalibration:
-    """Read kalibr's camera chain; ``T_cn_cnm1`` maps points of camera n-1 to camera n."""
-    fields, cameras = Fields(read_yaml(path)), []
-    T_right_left = fields.below("cam1").numbers("T_cn_cnm1", (4, 4))
-    check_rotation(T_right_left[:3, :3], "T_cn_cnm1")
-    for part in (fields.below("cam0"), fields.below("cam1")):
-        if (kind := part.text("camera_model")) != "pinhole":
-            expected = "pinhole (with radtan or equidistant distortion)"
-            what = "camera model is not supported"
-            raise FormatError(what, got=kind, expected=expected, hint=_AGAIN)
-        name = part.text("distortion_model")
-        cameras.append(_camera(part, _KALIBR_MODELS, name, "distortion_coeffs", path))
-    return StereoCalibration(cameras[0], cameras[1], orthonormalise(T_right_left))
-
-
 def _camera(
     fields: Fields, models: Models, name: str, coefficients: str, path: StrPath
 ) -> CameraIntrinsics:
@@ -280,7 +264,7 @@ def lens_of(
     if name not in models:
         expected = ", ".join(models)
         what = "lens model is not supported"
-        raise FormatError(what, where=where, got=name, expected=expected, hint=_AGAIN)
+        raise FormatError(what, where=where, got=name, expected=expected, hint=AGAIN)
     model, counts = models[name]
     if coefficients.size not in counts:
         what = f"lens model {name!r} has the wrong number of coefficients"

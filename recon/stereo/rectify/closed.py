@@ -10,13 +10,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+import cv2
 import numpy as np
 
 from recon.core.values import LensModel
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
 
 _PLAIN: Final = 1e-9  # radians: a lens of the model fov with less bends nothing
-_ROUNDS: Final = 50  # more than Newton's method needs to undo the distortion of an omni lens
+# OpenCV inverts a distortion iteratively, and stops early by default (five iterations, 0.01).
+EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
 
 
 @dataclass(frozen=True)
@@ -78,41 +80,26 @@ def _unproject_fov(lens: Float64, xy: Float64) -> Float64:
 
 
 def _project_omni(lens: Float64, xyz: Float64) -> Float64:
-    xi, near = lens[0], np.linalg.norm(xyz, axis=1)
+    xi, near = float(lens[0]), np.linalg.norm(xyz, axis=1)
     # Of a mirror with xi > 1 two directions share a place: those nearer to the axis are seen.
     ends = near / xi if xi > 1 else xi * near
     plane = _divided(xyz, xyz[:, 2] + xi * near, xyz[:, 2] > -ends)
-    return _bent(lens[1:], plane)[0]
+    flat = np.column_stack([plane, np.ones(len(plane))])
+    bent = cv2.projectPoints(flat, np.zeros(3), np.zeros(3), np.eye(3), lens[1:].copy())[0]
+    return np.asarray(bent).reshape(-1, 2)
 
 
 def _unproject_omni(lens: Float64, xy: Float64) -> Float64:
-    xi, plane = lens[0], xy.copy()
-    for _ in range(_ROUNDS):
-        bent, slope = _bent(lens[1:], plane)
-        step = np.linalg.solve(slope, (xy - bent)[..., None])[..., 0]
-        plane = plane + step
-        if not np.abs(np.nan_to_num(step)).max(initial=0.0) > 1e-14:
-            break
+    xi = lens[0]
+    plane = cv2.undistortPoints(
+        xy.reshape(-1, 1, 2), np.eye(3), lens[1:].copy(), criteria=EXACT
+    ).reshape(-1, 2)
     r2 = (plane**2).sum(axis=1)
     along = (xi + np.sqrt(1 + (1 - xi * xi) * r2)) / (r2 + 1)
     return np.column_stack([along[:, None] * plane, along - xi])
 
 
-def _bent(lens: Float64, xy: Float64) -> tuple[Float64, Float64]:
-    """Return places (N, 2) bent by k1 k2 p1 p2, and the slope (N, 2, 2) of that."""
-    k1, k2, p1, p2 = lens
-    x, y = xy.T
-    r2, u = x * x + y * y, 1 + (k1 + k2 * (x * x + y * y)) * (x * x + y * y)
-    du = 2 * k1 + 4 * k2 * r2
-    bent = [u * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), u * y + p1 * (r2 + 2 * y * y)]
-    bent[1] = bent[1] + 2 * p2 * x * y
-    across = du * x * y + 2 * p1 * x + 2 * p2 * y
-    rows = [u + du * x * x + 2 * p1 * y + 6 * p2 * x, across, across]
-    rows.append(u + du * y * y + 6 * p1 * y + 2 * p2 * x)
-    return np.stack(bent, axis=1), np.stack(rows, axis=1).reshape(-1, 2, 2)
-
-
-def _divided(xyz: Float64, by: Float64, seen: Float64) -> Float64:
+def _divided(xyz: Float64, by: Float64, seen: Bool) -> Float64:
     return np.where((seen & (by > 0))[:, None], xyz[:, :2] / by[:, None], np.nan)
 
 

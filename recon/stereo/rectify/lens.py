@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.arrays import Float32, Float64
-from recon.stereo.rectify.closed import CLOSED_FORMS
+from recon.stereo.rectify.closed import CLOSED_FORMS, EXACT
 
 _ORIGIN: Final = np.zeros(3)
 _LARGEST_MISS_PX: Final = 0.01  # largest reprojection error of a correctly inverted ray
-
-# OpenCV inverts a lens model iteratively, and stops early by default (five iterations, 0.01).
-_EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
 
 
 def project_raw(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
@@ -94,7 +91,7 @@ def rays_of(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
             rays = CLOSED_FORMS[camera.model].unproject(distortion, plane)
             return np.asarray(np.where(rays[:, 2:] > 0, rays / rays[:, 2:], np.nan))
     model: Any = cv2.fisheye if camera.model == "fisheye" else cv2
-    plane = model.undistortPoints(points, matrix, distortion, criteria=_EXACT)
+    plane = model.undistortPoints(points, matrix, distortion, criteria=EXACT)
     rays = np.concatenate([plane.reshape(-1, 2), np.ones((len(points), 1))], axis=1)
     # OpenCV marks some failures of the fisheye model with -1e6; of other failures, and of rays at
     # more than 90 degrees, it returns the ray of another pixel.
