@@ -7,6 +7,7 @@ What is asked of a file is two cameras first, and then how they stand to each ot
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
 
@@ -92,6 +93,16 @@ def read_named(
     return _Named(contents, form, path, unit_m).rig(size_px)
 
 
+@reader
+def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
+    """Read a camera from its ``sensor.yaml``, and ``T_body_camera`` (4, 4), metres."""
+    named = _Named(read_contents(path), "sensor.yaml", path, 1.0)
+    T = named.in_body("")
+    if T is None:
+        raise FormatError("sensor.yaml has no T_BS")
+    return named.camera("", named.matrix(""), None), T
+
+
 def _with_others(path: Path, contents: Contents) -> Contents:
     """Return the contents together with those of the files that belong to a file."""
     for one, other in (("intrinsics", "extrinsics"), ("extrinsics", "intrinsics")):
@@ -152,7 +163,11 @@ class _Named:
             renamed = {re.sub(old, new, key): value for key, value in renamed.items()}
         words = {k: _words(k, v) for k, v in renamed.items() if not _OTHERS.search(k)}
         known = {" ".join(each) for each in words.values()}
-        sided = [(*_sided(each, known), renamed[key]) for key, each in words.items()]
+        first = any(
+            "0" in each and _twin(each, each.index("0"), "1") in known for each in words.values()
+        )
+        sides = (*_SIDES[:2], _SIDES[2] if first else _SIDES[3])  # of three cameras the first two
+        sided = [(*_sided(each, known, sides), renamed[key]) for key, each in words.items()]
         self._values: dict[tuple[Side, str], Value] = {}
         for at in range(max(map(len, words.values()), default=0)):  # whole names first
             for side, rest, value in sided:
@@ -174,12 +189,12 @@ class _Named:
 
     def rig(self, size_px: Size | None) -> Rig | None:
         """Return the rig that the names are of; None = there is no camera in them."""
-        left, right, one = (self._matrix(side) for side in (*_BOTH, ""))
+        left, right, one = (self.matrix(side) for side in (*_BOTH, ""))
         if left is None and right is None and one is None:
             return self._projected(size_px)
         if left is None or right is None:
-            return self._rectified(self._camera("", one, size_px), None)
-        cameras = self._camera("left", left, size_px), self._camera("right", right, size_px)
+            return self._rectified(self.camera("", one, size_px), None)
+        cameras = self.camera("left", left, size_px), self.camera("right", right, size_px)
         turns, projections = [self.find("rectifying", side) for side in _BOTH], self._projections()
         T = self._pose()
         if T is not None:
@@ -194,7 +209,7 @@ class _Named:
         _check_unit(rig.baseline_m)
         return rig
 
-    def _matrix(self, side: Side) -> Float64 | None:
+    def matrix(self, side: Side) -> Float64 | None:
         """Return the camera matrix (3, 3) of a side, pixel centres at integers; None = none."""
         found, vector = self.find("K", side), self.find("vector", side)
         focal, centre = self.find("focal", side), self.find("centre", side)
@@ -213,7 +228,7 @@ class _Named:
             matrix[:2, 2] -= 1  # its first pixel is (1, 1)
         return matrix
 
-    def _camera(self, side: Side, matrix: Float64 | None, size_px: Size | None) -> CameraIntrinsics:
+    def camera(self, side: Side, matrix: Float64 | None, size_px: Size | None) -> CameraIntrinsics:
         if matrix is None:
             raise self._lacks("two camera matrices", "K1 and K2, or mtxL and mtxR")
         stated = self._size(side)
@@ -255,22 +270,27 @@ class _Named:
             raise FormatError("image size is not in whole pixels", got=f"{width} x {height}")
         return int(width), int(height)
 
-    def _lens(self, side: Side) -> LensModel | None:
-        """Return the lens model that a file names: if it names two, the one that is no pinhole."""
-        found: list[LensModel] = []
+    def _models(self, side: Side) -> list[str]:
+        """Return what a file calls the lens model, in small letters alone."""
+        found = []
         for name in _TABLES["words"]["models"].split():
             value = self._values.get((side, name), self._values.get(("", name), ""))
             if isinstance(value, np.ndarray):
                 value = f"{value.item():g}" if "OAK" in self._form and value.size == 1 else ""
             plain = re.sub(r"[^a-z0-9]", "", value.lower()).removeprefix("distortion")
-            if plain in _LENS_OF:
-                found.append(_LENS_OF[plain])
-            elif plain and name != "model":  # which may as well be that of the camera
-                what = f"lens model of this {self._form} is not supported"
-                raise FormatError(
-                    what, got=value, expected=", ".join(LENS_COEFFICIENTS), hint=AGAIN
-                )
-        return next((lens for lens in found if lens != "pinhole"), found[0] if found else None)
+            if plain and (plain in _LENS_OF or name != "model"):  # that may be of the camera
+                found.append(plain)
+        return found
+
+    def _lens(self, side: Side) -> LensModel | None:
+        """Return the lens model that a file names: if it names two, the one that is no pinhole."""
+        models, expected = self._models(side), ", ".join(LENS_COEFFICIENTS)
+        for name in models:
+            if name not in _LENS_OF:
+                what = "lens model is not supported"
+                raise FormatError(what, got=name, expected=expected, hint=AGAIN)
+        lenses = sorted((_LENS_OF[name] for name in models), key="pinhole".__eq__)
+        return lenses[0] if lenses else None
 
     def _distortion(self, side: Side, lens: LensModel) -> Float64:
         vector, given = self.find("vector", side), self.find("D", side, "")
@@ -289,6 +309,8 @@ class _Named:
         if given is None or (lens == "pinhole" and count not in _PINHOLE_COUNTS):
             what, got = "distortion has the wrong size", counted(count, "coefficient")
             raise FormatError(what, got=got, expected="4, 5, 8, 12 or 14")
+        if given.any() and "none" in self._models(side):
+            raise FormatError("a lens without distortion has coefficients", got=given.tolist())
         return np.concatenate([head, given.ravel()])
 
     def _pose(self) -> Float64 | None:
@@ -306,7 +328,7 @@ class _Named:
                 columns = "RealSense" in self._form and turn.ndim == 1
                 T = make_transform(R.T if columns or way == "_rows" else R, step.ravel())
                 return invert(_rigid(T)) if way == "_back" else T
-        bodies = [self._in_body(side) for side in _BOTH]
+        bodies = [self.in_body(side) for side in _BOTH]
         if bodies[0] is not None and bodies[1] is not None:
             return np.asarray(invert(bodies[1]) @ bodies[0])
         zed = [self.number(name) for name in ("baseline", "ty", "tz", "rx", "cv", "rz")]
@@ -316,7 +338,7 @@ class _Named:
         numbers = np.array([each or 0.0 for each in zed])
         return make_transform(exp_so3(numbers[3:]), -numbers[:3])
 
-    def _in_body(self, side: Side) -> Float64 | None:
+    def in_body(self, side: Side) -> Float64 | None:
         """Return ``T_body_camera`` (4, 4) of a side; None = it is not there."""
         ahead, back = self.find("body_camera", side), self.find("camera_body", side)
         place, way = self.find("position", side), self.find("orientation", side)
@@ -339,7 +361,7 @@ class _Named:
         both = self._projections()
         if both is None:
             return None
-        left = self._camera("left", both[0][:, :3], size_px)
+        left = self.camera("left", both[0][:, :3], size_px)
         camera = projected_rig({"P1": both[0], "P2": both[1]}, left.width_px, left.height_px)
         _check_unit(camera.baseline_m)
         return camera
@@ -407,17 +429,23 @@ def _words(key: str, value: Value) -> list[str]:
     return [word.lower() for word in words] + whole
 
 
-def _sided(words: list[str], known: set[str]) -> tuple[Side, list[str]]:
+def _sided(
+    words: list[str], known: set[str], sides: Sequence[tuple[str, str]]
+) -> tuple[Side, list[str]]:
     """Return the side of a name, and its other words.
 
     ``R``, ``1`` and the like are a side if the same name is there with the other one, else if it
     is the name of a matrix of cameras.
     """
     for alone in (False, True):
-        for names in _SIDES:
+        for names in sides:
             for at in (at for at, word in enumerate(words) if word in names and len(words) > 1):
-                rest, other = words[:at] + words[at + 1 :], names[names[0] == words[at]]
-                twin = " ".join([*words[:at], other, *words[at + 1 :]])
-                if twin in known or (alone and rest[-1] in _OF_CAMERAS):
-                    return _BOTH[words[at] == names[1]], rest
+                rest, right = words[:at] + words[at + 1 :], words[at] == names[1]
+                named = alone and rest[-1] in _OF_CAMERAS
+                if named or _twin(words, at, names[not right]) in known:
+                    return _BOTH[right], rest
     return "", words
+
+
+def _twin(words: list[str], at: int, other: str) -> str:
+    return " ".join([*words[:at], other, *words[at + 1 :]])

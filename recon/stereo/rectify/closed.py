@@ -7,7 +7,6 @@ any length; NaN where the model ends.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Final
 
 import cv2
@@ -16,17 +15,11 @@ import numpy as np
 from recon.core.values import LensModel
 from recon.core.values.arrays import Bool, Float64
 
+#: From coefficients and points (N, 3) to places (N, 2), and from those to directions (N, 3).
+Lens = Callable[[Float64, Float64], Float64]
 _PLAIN: Final = 1e-9  # radians: a lens of the model fov with less bends nothing
 # OpenCV inverts a distortion iteratively, and stops early by default (five iterations, 0.01).
 EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
-
-
-@dataclass(frozen=True)
-class ClosedForm:
-    """A lens model by its two functions of coefficients and points, float64 (N, 3) and (N, 2)."""
-
-    project: Callable[[Float64, Float64], Float64]
-    unproject: Callable[[Float64, Float64], Float64]
 
 
 def _project_ds(lens: Float64, xyz: Float64) -> Float64:
@@ -106,9 +99,9 @@ def _divided(xyz: Float64, by: Float64, seen: Bool) -> Float64:
 #: Ref: ds: Usenko et al., "The Double Sphere Camera Model", 3DV 2018, eqs. 40-50; eucm: Khomutenko
 #: et al., "An Enhanced Unified Camera Model", RA-L 2016; fov: Devernay and Faugeras, 2001; omni:
 #: Mei and Rives, ICRA 2007.
-CLOSED_FORMS: Final[Mapping[LensModel, ClosedForm]] = {
-    "ds": ClosedForm(_project_ds, _unproject_ds),
-    "eucm": ClosedForm(_project_eucm, _unproject_eucm),
-    "fov": ClosedForm(_project_fov, _unproject_fov),
-    "omni": ClosedForm(_project_omni, _unproject_omni),
+CLOSED_FORMS: Final[Mapping[LensModel, tuple[Lens, Lens]]] = {
+    "ds": (_project_ds, _unproject_ds),
+    "eucm": (_project_eucm, _unproject_eucm),
+    "fov": (_project_fov, _unproject_fov),
+    "omni": (_project_omni, _unproject_omni),
 }

@@ -19,12 +19,11 @@ _LARGEST_MISS_PX: Final = 0.01  # largest reprojection error of a correctly inve
 
 def project_raw(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
     """Return float64 (N, 2), pixels of points (N, 3) in camera axes; NaN at or behind its plane."""
-    form = CLOSED_FORMS.get(camera.model)
-    if form is None:
+    if camera.model not in CLOSED_FORMS:
         return project_with_jacobian(camera, xyz)[0]
     points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
     with np.errstate(all="ignore"):
-        plane = form.project(camera.distortion, points)
+        plane = CLOSED_FORMS[camera.model][0](camera.distortion, points)
     pixels = plane @ camera.matrix[:2, :2].T + camera.matrix[:2, 2]
     return np.asarray(np.where(points[:, 2:] > 0, pixels, np.nan))
 
@@ -88,7 +87,7 @@ def rays_of(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     if camera.model in CLOSED_FORMS:
         plane = (points[:, 0] - matrix[:2, 2]) @ np.linalg.inv(matrix[:2, :2]).T
         with np.errstate(all="ignore"):
-            rays = CLOSED_FORMS[camera.model].unproject(distortion, plane)
+            rays = CLOSED_FORMS[camera.model][1](distortion, plane)
             return np.asarray(np.where(rays[:, 2:] > 0, rays / rays[:, 2:], np.nan))
     model: Any = cv2.fisheye if camera.model == "fisheye" else cv2
     plane = model.undistortPoints(points, matrix, distortion, criteria=EXACT)

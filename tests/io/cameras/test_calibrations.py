@@ -334,9 +334,6 @@ def test_opencv_files_in_millimetres_and_with_extrinsics_beside_them_are_read(tm
     read = read_calibration(path, 640, 480)
     np.testing.assert_array_equal(read.T_right_left, T_RIGHT_LEFT)
     np.testing.assert_array_equal(read_calibration(beside, 640, 480).T_right_left, T_RIGHT_LEFT)
-    path.unlink()
-    with pytest.raises(FormatError, match=r"extrinsics\.yml: not a calibration file of a known"):
-        read_calibration(beside, 640, 480)
 
 
 @pytest.mark.parametrize("suffix", ["yml", "json"])
