@@ -40,8 +40,9 @@ def read_rig(
     check_given_once(settings.calibration, settings)
     if settings.numbers:
         return camera_of_numbers(settings, size), ()
-    path = Path(settings.calibration or folder)
-    path = find_calibration(path) if settings.calibration is None or path.is_dir() else path
+    place = Path(settings.calibration or folder)
+    named = settings.calibration is not None and not place.is_dir()
+    path = place if named else find_calibration(place)
     if path is None:
         expected = "calib.txt, calibration.yaml, … in the folder"
         raise SourceError("calibration is missing", where=folder, expected=expected, hint=CALIBRATE)

@@ -37,6 +37,12 @@ _TIGHT: Final = re.compile(r"^([A-Za-z][\w.]*):(?=[^\s/])", re.MULTILINE)  # ``s
 _SECTION: Final = re.compile(r"\A\s*\[\w+\]\s*$", re.MULTILINE)
 #: How names of files end that are no text; the first are pickles.
 BINARY: Final = (".pkl", ".pickle", ".p", ".npz", ".npy", ".mat")
+_PICKLE: Final = "a pickle runs the code that is in it, and is not read"
+_REFUSED: Final = {  # by how a file begins
+    b"\x80": _PICKLE,
+    b"\x89HDF": "a file of HDF5 is no calibration that is read",
+    b"\x93NUMPY": "one array of NumPy is no calibration of a pair",
+}
 _XML_ROOT: Final = "opencv_storage"
 _MOST_BYTES: Final = 1 << 20  # of an array: more than a matrix has, less than tables of a remap
 _VECTORS: Final = {frozenset(names): names for names in (
@@ -58,13 +64,11 @@ def read_contents(path: StrPath) -> Contents:
         return dict(_flat(_read_arrays(path)))
     if head.startswith(b"MATLAB"):
         return dict(_flat(_read_matlab(read_bytes(path, SMALL_FILE_BYTES))))
-    if head.startswith(b"\x89HDF\r\n\x1a\n"):
-        raise FormatError("a file of HDF5 is no calibration that is read", hint=SAVE)
-    if head.startswith(b"\x93NUMPY"):
-        raise FormatError("one array of NumPy is no calibration of a pair", hint=SAVE)
-    if head.startswith(b"\x80") or Path(path).suffix in BINARY[:3]:
-        what = "a pickle runs the code that is in it, and is not read"
-        raise FormatError(what, hint=f"load it where it was written, and {SAVE}")
+    refused = [what for sign, what in _REFUSED.items() if head.startswith(sign)]
+    if refused or Path(path).suffix in BINARY[:3]:
+        raise FormatError(
+            (refused or [_PICKLE])[0], hint=f"load it where it was written, and {SAVE}"
+        )
     return dict(_flat(_parse(read_text(path, SMALL_FILE_BYTES), path)))
 
 
@@ -103,23 +107,19 @@ def _xml_node(element: ET.Element) -> Any:
 
 def _read_arrays(path: StrPath) -> dict[str, Any]:
     """Return the small arrays of an archive of NumPy; a pickled one is never loaded."""
-    arrays, pickled = {}, False
+    arrays: dict[str, Any] = {}
     with zipfile.ZipFile(path) as archive:
-        names = [each.filename for each in archive.infolist() if each.file_size <= _MOST_BYTES]
-        for name in names:
-            if not name.endswith(".npy"):
+        for each in archive.infolist():
+            if each.file_size > _MOST_BYTES or not each.filename.endswith(".npy"):
                 continue
             try:
-                with archive.open(name) as member:
-                    array = np.lib.format.read_array(member, allow_pickle=False)
+                array = np.lib.format.read_array(archive.open(each), allow_pickle=False)
+                arrays[each.filename.removesuffix(".npy")] = array
             except ValueError as error:
                 if "allow_pickle" not in str(error):
                     raise
-                pickled = True
-                continue
-            arrays[name.removesuffix(".npy")] = array
     if not arrays:
-        what = "archive has no arrays of numbers" if not pickled else "arrays are pickled objects"
+        what = "archive has no arrays of numbers, but pickled objects or none"
         raise FormatError(what, expected="matrices K1, D1, K2, D2, R, T", hint=SAVE)
     return arrays
 

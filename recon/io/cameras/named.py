@@ -129,27 +129,23 @@ def _of_resolution(
         raise FormatError(what, expected=expected, hint="pass width_px and height_px")
     if size_px not in known:
         raise other_size(*size_px, expected, where)
-    own = re.compile(
-        rf"(?:(LEFT|RIGHT)_CAM_{known[size_px]}\.|STEREO\.)(\w+?)(?:_{known[size_px]})?"
-    )
-    found = [(own.fullmatch(key), value) for key, value in contents.items()]
-    return {f"{key[1] or ''}.{key[2]}": value for key, value in found if key}, size_px
+    for old in (rf"_CAM_{known[size_px]}(?=\.)", rf"^STEREO\.|_{known[size_px]}$"):
+        contents = {re.sub(old, "", key): value for key, value in contents.items()}
+    return {key: value for key, value in contents.items() if "_" not in key}, size_px
 
 
 def _of_sockets(contents: Contents) -> Contents:
     """Return what an OAK's file says of the cameras of its stereo pair."""
     found: Contents = {}
     sockets = [contents.get(f"stereoRectificationData.{side}CameraSocket") for side in _BOTH]
-    for side, socket, other in zip(_BOTH, sockets, sockets[::-1], strict=True):
+    backs = ("", "inverse")
+    for side, back, socket, other in zip(_BOTH, backs, sockets, sockets[::-1], strict=True):
         start = f"cameraData.{socket:g}." if isinstance(socket, np.ndarray) else "?"
-        leads = contents.get(f"{start}extrinsics.toCameraSocket") == other
-        for key, value in contents.items():
-            name = key.removeprefix(start)
-            if "extrinsics" not in name and name != key:
-                found[f"{side}.{name}"] = value
-            elif leads and name != key and "spec" not in name:
-                back = "" if side == "left" else "inverse"
-                found[back + name.removeprefix("extrinsics.")] = value
+        own = {k.removeprefix(start): v for k, v in contents.items() if k.startswith(start)}
+        leads = own.get("extrinsics.toCameraSocket") == other
+        found |= {f"{side}.{key}": v for key, v in own.items() if "extrinsics" not in key}
+        for key in ("rotationMatrix", "translation") if leads else ():
+            found[back + key] = own.get(f"extrinsics.{key}", "")
     return found
 
 
@@ -190,12 +186,18 @@ class _Named:
     def rig(self, size_px: Size | None) -> Rig | None:
         """Return the rig that the names are of; None = there is no camera in them."""
         left, right, one = (self.matrix(side) for side in (*_BOTH, ""))
-        if left is None and right is None and one is None:
-            return self._projected(size_px)
-        if left is None or right is None:
-            return self._rectified(self.camera("", one, size_px), None)
-        cameras = self.camera("left", left, size_px), self.camera("right", right, size_px)
         turns, projections = [self.find("rectifying", side) for side in _BOTH], self._projections()
+        if left is None and right is None and one is None:
+            if projections is None:
+                return None
+            named = {"P1": projections[0], "P2": projections[1]}
+            camera = self.camera("left", named["P1"][:, :3], size_px)
+            rectified = projected_rig(named, camera.width_px, camera.height_px)
+            _check_unit(rectified.baseline_m)
+            return rectified
+        if left is None or right is None:
+            return self._rectified(*2 * (self.camera("", one, size_px),))
+        cameras = self.camera("left", left, size_px), self.camera("right", right, size_px)
         T = self._pose()
         if T is not None:
             T[:3, 3] *= self._unit_m
@@ -315,12 +317,10 @@ class _Named:
 
     def _pose(self) -> Float64 | None:
         """Return ``T_right_left`` (4, 4) in units of the file; None = there is none."""
-        # Of more than two cameras, the second has that from the first.
-        ahead, back = (self.find(each, "", *_BOTH) for each in ("right_left", "left_right"))
-        if ahead is not None:
-            return _rigid(ahead)
-        if back is not None:
-            return invert(_rigid(back))
+        for field in ("right_left", "left_right"):
+            # Of more than two cameras, the second has that from the first.
+            if (found := self.find(field, "", *_BOTH)) is not None:
+                return _rigid(found) if field == "right_left" else invert(_rigid(found))
         for way in ("", "_rows", "_back"):
             turn, step = self.find(f"rotation{way}"), self.find(f"translation{way}")
             if turn is not None and step is not None:
@@ -344,9 +344,9 @@ class _Named:
         place, way = self.find("position", side), self.find("orientation", side)
         if place is not None and way is not None:
             ahead = np.concatenate([place.ravel(), way.ravel()])
-        if ahead is not None:
-            return _rigid(ahead)
-        return None if back is None else invert(_rigid(back))
+        if ahead is None:
+            return None if back is None else invert(_rigid(back))
+        return _rigid(ahead)
 
     def _projections(self) -> tuple[Float64, Float64] | None:
         """Return both ``P`` (3, 4), metres; None = they are not there."""
@@ -356,19 +356,8 @@ class _Named:
         scale = np.array([1.0, 1.0, 1.0, self._unit_m])
         return left.reshape(3, 4) * scale, right.reshape(3, 4) * scale
 
-    def _projected(self, size_px: Size | None) -> RectifiedCamera | None:
-        """Return the rectified camera of two projection matrices alone; None = there are none."""
-        both = self._projections()
-        if both is None:
-            return None
-        left = self.camera("left", both[0][:, :3], size_px)
-        camera = projected_rig({"P1": both[0], "P2": both[1]}, left.width_px, left.height_px)
-        _check_unit(camera.baseline_m)
-        return camera
-
-    def _rectified(self, left: CameraIntrinsics, right: CameraIntrinsics | None) -> RectifiedCamera:
+    def _rectified(self, left: CameraIntrinsics, right: CameraIntrinsics) -> RectifiedCamera:
         """Return the rectified camera of matrices and a baseline, where that is all there is."""
-        right = right or left
         bf, baseline = self.number("bf"), self.number("baseline")
         f, cx, cy = (float(left.matrix[at]) for at in ((0, 0), (0, 2), (1, 2)))
         if baseline is None and bf is not None:

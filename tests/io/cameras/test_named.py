@@ -348,7 +348,7 @@ def test_rectified_cameras_of_bare_numbers_and_settings_are_read(tmp_path):
 def test_two_files_of_a_realsense_are_read_as_one_from_either(tmp_path, given_to):
     camera = {"image_width": 1280, "image_height": 720,
               "projection": {"fx": 640.0, "fy": 640.0, "cx": 640.0, "cy": 360.0},
-              "distortion": {"do_undistortion": False, "k1": 0.0, "k2": 0.0, "k3": 0.0}}  # fmt: skip
+              "distortion": {"do_undistortion": False, "k1": 0.0, "k3": 0.0}}  # fmt: skip
     way = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
     poses = {f"body_to_{side}": {"position": {"x": x, "y": 0.0, "z": 0.0}, "orientation": way}
              for side, x in (("left", 0.0), ("right", 0.05))}  # fmt: skip
