@@ -190,6 +190,8 @@ class _Named:
         if left is None and right is None and one is None:
             if projections is None:
                 return None
+            if self.find("rotation") is not None:  # of raw cameras, that are called otherwise
+                self.camera("", None, size_px)
             named = {"P1": projections[0], "P2": projections[1]}
             camera = self.camera("left", named["P1"][:, :3], size_px)
             rectified = projected_rig(named, camera.width_px, camera.height_px)

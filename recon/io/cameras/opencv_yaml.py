@@ -18,13 +18,16 @@ def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> N
     models = {calibration.left.model, calibration.right.model}
     if len(models) > 1:
         raise CalibrationError("an OpenCV file cannot store two lens models", where=path)
+    if models - {"pinhole", "fisheye"}:
+        what = "an OpenCV file cannot store this lens model"
+        raise CalibrationError(what, where=path, got=calibration.left.model)
     suffix = Path(path).suffix.lower()
     kind = suffix if suffix in {".xml", ".json"} else ".yml"
     storage = cv2.FileStorage(kind, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("image_width", calibration.left.width_px)
     storage.write("image_height", calibration.left.height_px)
-    if "pinhole" not in models:
-        storage.write("distortion_model", calibration.left.model)
+    if "fisheye" in models:
+        storage.write("distortion_model", "fisheye")
     for number, camera in enumerate((calibration.left, calibration.right), start=1):
         storage.write(f"M{number}", np.array(camera.matrix))
         storage.write(f"D{number}", np.array(camera.distortion).reshape(1, -1))

@@ -294,6 +294,7 @@ def test_what_a_program_writes_of_a_rig_is_read_as_that_rig(tmp_path, write, len
     {"K1": "left_K", "K2": "right_K", "D1": "left_dist", "D2": "right_dist"},
     {"K1": "mtx1", "K2": "mtx2", "D1": "dist1", "D2": "dist2", "R": "rotation_matrix",
      "T": "translation_vector"},
+    {"K1": "CM1", "K2": "CM2", "R": "R_stereo", "T": "T_stereo"},
     {"K1": "K0", "K2": "K1", "D1": "D0", "D2": "D1"},
     {"K1": "mtxl", "K2": "mtxr", "D1": "distl", "D2": "distr"},
     {"K1": "leftCameraMatrix", "K2": "rightCameraMatrix", "D1": "leftDistortion",
@@ -390,6 +391,17 @@ def test_pickles_are_refused_with_what_to_do_and_never_loaded(tmp_path, monkeypa
     with pytest.raises(FormatError, match=r"c\.\w+: .*(pickle|one array).*np\.savez"):
         read_calibration(path, *SIZE)
     assert not (tmp_path / "ran").exists()
+
+
+def test_matrices_of_rectified_views_are_not_taken_for_those_of_raw_cameras(tmp_path):
+    K = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
+    P1, P2 = np.hstack([K, np.zeros((3, 1))]), np.hstack([K, [[-84.0], [0], [0]]])
+    np.savez(tmp_path / "c.npz", newCameraMatrixL=K, newCameraMatrixR=K, P1=P1, P2=P2,
+             R=np.eye(3), T=[-0.12, 0, 0])  # fmt: skip
+    with pytest.raises(FormatError, match="no two camera matrices"):
+        read_calibration(tmp_path / "c.npz", *SIZE)
+    np.savez(tmp_path / "c.npz", P1=P1, P2=P2)
+    assert read_calibration(tmp_path / "c.npz", *SIZE).baseline_m == pytest.approx(0.12)
 
 
 def test_pickled_arrays_beside_matrices_are_left_out(tmp_path):
