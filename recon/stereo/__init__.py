@@ -8,5 +8,5 @@
   `match/fine.py`.
 
 The loops are in `kernels/`. `rectify/` also has what calibration and audit need of cameras: lenses
-(`lens.py`, those with closed forms in `closed.py`), epipolar lines, matched features.
+(`rectify/lens.py`, `rectify/closed.py`), epipolar lines, matched features.
 """
