@@ -66,9 +66,7 @@ def read_contents(path: StrPath) -> Contents:
         return dict(_flat(_read_matlab(read_bytes(path, SMALL_FILE_BYTES))))
     refused = [what for sign, what in _REFUSED.items() if head.startswith(sign)]
     if refused or Path(path).suffix in BINARY[:3]:
-        raise FormatError(
-            (refused or [_PICKLE])[0], hint=f"load it where it was written, and {SAVE}"
-        )
+        raise FormatError((*refused, _PICKLE)[0], hint=f"load it where it was written, and {SAVE}")
     return dict(_flat(_parse(read_text(path, SMALL_FILE_BYTES), path)))
 
 

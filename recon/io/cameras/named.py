@@ -138,14 +138,13 @@ def _of_sockets(contents: Contents) -> Contents:
     """Return what an OAK's file says of the cameras of its stereo pair."""
     found: Contents = {}
     sockets = [contents.get(f"stereoRectificationData.{side}CameraSocket") for side in _BOTH]
-    backs = ("", "inverse")
-    for side, back, socket, other in zip(_BOTH, backs, sockets, sockets[::-1], strict=True):
+    for side, socket, other in zip(_BOTH, sockets, sockets[::-1], strict=True):
         start = f"cameraData.{socket:g}." if isinstance(socket, np.ndarray) else "?"
         own = {k.removeprefix(start): v for k, v in contents.items() if k.startswith(start)}
         leads = own.get("extrinsics.toCameraSocket") == other
         found |= {f"{side}.{key}": v for key, v in own.items() if "extrinsics" not in key}
         for key in ("rotationMatrix", "translation") if leads else ():
-            found[back + key] = own.get(f"extrinsics.{key}", "")
+            found[("" if side == "left" else "inverse") + key] = own.get(f"extrinsics.{key}", "")
     return found
 
 
@@ -159,10 +158,9 @@ class _Named:
             renamed = {re.sub(old, new, key): value for key, value in renamed.items()}
         words = {k: _words(k, v) for k, v in renamed.items() if not _OTHERS.search(k)}
         known = {" ".join(each) for each in words.values()}
-        first = any(
-            "0" in each and _twin(each, each.index("0"), "1") in known for each in words.values()
-        )
-        sides = (*_SIDES[:2], _SIDES[2] if first else _SIDES[3])  # of three cameras the first two
+        zeros = [_twin(each, each.index("0"), "1") for each in words.values() if "0" in each]
+        # Of three cameras the first two.
+        sides = (*_SIDES[:2], _SIDES[2] if known.intersection(zeros) else _SIDES[3])
         sided = [(*_sided(each, known, sides), renamed[key]) for key, each in words.items()]
         self._values: dict[tuple[Side, str], Value] = {}
         for at in range(max(map(len, words.values()), default=0)):  # whole names first
@@ -207,8 +205,8 @@ class _Named:
         elif turns[0] is None or turns[1] is None or projections is None:
             return self._rectified(*cameras)
         else:
-            R = (turns[0].reshape(3, 3), turns[1].reshape(3, 3))
-            both = (cameras[0], R[0]), (cameras[1], R[1])
+            left, right = turns[0].reshape(3, 3), turns[1].reshape(3, 3)
+            both = (cameras[0], left), (cameras[1], right)
             rig = rig_of_camera_infos(*both, projections, self._where)
         _check_unit(rig.baseline_m)
         return rig
@@ -309,6 +307,9 @@ class _Named:
             given = np.array([self.number(name, side, "") or 0.0 for name in names])
             if lens == "pinhole":
                 given = given[: next(n for n in _PINHOLE_COUNTS if not given[n:].any())]
+        most = len(LENS_COEFFICIENTS[lens]) - head.size
+        if given is not None and not given.ravel()[most:].any():  # padded, as OAK's are
+            given = given.ravel()[:most]
         count = head.size + (sizes[0] if given is None else given.size)
         if given is None or (lens == "pinhole" and count not in _PINHOLE_COUNTS):
             what, got = "distortion has the wrong size", counted(count, "coefficient")

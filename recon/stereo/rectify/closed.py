@@ -66,9 +66,8 @@ def _project_fov(lens: Float64, xyz: Float64) -> Float64:
 def _unproject_fov(lens: Float64, xy: Float64) -> Float64:
     w = max(float(lens[0]), _PLAIN)
     angle = w * np.hypot(xy[:, 0], xy[:, 1])
-    rays = np.column_stack(
-        [w * np.sinc(angle / np.pi)[:, None] * xy, np.cos(angle) * 2 * np.tan(w / 2)]
-    )
+    across = w * np.sinc(angle / np.pi)[:, None] * xy
+    rays = np.column_stack([across, 2 * np.tan(w / 2) * np.cos(angle)])
     return np.where((angle < np.pi)[:, None], rays, np.nan)
 
 

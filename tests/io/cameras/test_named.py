@@ -82,8 +82,9 @@ def _oak(path: Path, rig: StereoCalibration, T: np.ndarray, owner: int) -> Path:
         own = {"rotationMatrix": T[:3, :3].tolist(), "translation": step,
                "specTranslation": {"x": 1, "y": 2, "z": 3},
                "toCameraSocket": 3 - socket if socket == owner else -1}  # fmt: skip
-        lens = np.pad(camera.distortion, (0, 9)).tolist()
-        cameras.append([socket, {"cameraType": 0, "distortionCoeff": lens, "extrinsics": own,
+        lens = np.pad(camera.distortion, (0, 14 - camera.distortion.size)).tolist()
+        kind = int(camera.model == "fisheye")
+        cameras.append([socket, {"cameraType": kind, "distortionCoeff": lens, "extrinsics": own,
                                  "height": 720, "width": 1280,
                                  "intrinsicMatrix": camera.matrix.tolist()}])  # fmt: skip
     cameras.append([0, {"intrinsicMatrix": np.eye(3).tolist(), "width": 4056, "height": 3040}])
@@ -259,6 +260,7 @@ Write = Callable[[Path, StereoCalibration], Path]
 WRITTEN: list[tuple[Write, LensModel, int]] = [
     *((each, "pinhole", 5) for each in (npz, zed, oak, oak_of_the_right, matlab, bouguet,
                                         realsense, orb_slam_3, orb_slam_2)),
+    (oak, "fisheye", 4),
     (vins, "pinhole", 4), (vins, "fisheye", 4), (vins, "omni", 5), (basalt, "ds", 2),
     *((kalibr, lens, 4) for lens in ("ds", "eucm", "fov", "omni", "fisheye")),
     *((ours, lens, 4) for lens in ("ds", "eucm", "fov", "omni")),
