@@ -50,7 +50,7 @@ Ndisp = Annotated[
 Calib = Annotated[
     Path | None,
     opt.option(
-        "Calibration file: recon, KITTI, Middlebury, OpenCV, ROS CameraInfo or kalibr. "
+        "Calibration file: OpenCV, NumPy, MATLAB, ROS, kalibr, KITTI, ZED and others. "
         "Without one, the pair must be rectified already."
     ),
 ]

@@ -13,8 +13,10 @@ from recon.core.values import RectifiedCamera, Rig, StereoCalibration
 from recon.io.cameras.calibration import read_calibration
 from recon.sources.settings import SourceSettings
 
-_NAME: Final = re.compile(
-    r"(calib|calibration|rig|stereo|cam_?chain|intrinsics|cameras?)([._-].*)?\.(txt|ya?ml|xml|json)"
+_NAMES: Final = (  # of calibrations, the surest first
+    r"(calib|calibration|rig|stereo|cam_?chain|intrinsics|cameras?)([._-].*)?\.(txt|ya?ml|xml|json)",
+    r"(calib|calibration|stereo)([._-].*)?\.(npz|mat)|sn\d+\.conf|k\.txt|left\.ya?ml",
+    r".*[._-](calib|calibration|intrinsics)\.(txt|ya?ml|xml|json|npz|mat)",
 )
 RIG_FILE: Final = "rig.yaml"  # the refined calibration, in the folder of a run
 # Focal lengths, skew and principal row: all of a camera matrix but the principal column.
@@ -38,7 +40,9 @@ def read_rig(
     check_given_once(settings.calibration, settings)
     if settings.numbers:
         return camera_of_numbers(settings, size), ()
-    path = find_calibration(folder) if settings.calibration is None else Path(settings.calibration)
+    place = Path(settings.calibration or folder)
+    named = settings.calibration is not None and not place.is_dir()
+    path = place if named else find_calibration(place)
     if path is None:
         expected = "calib.txt, calibration.yaml, … in the folder"
         raise SourceError("calibration is missing", where=folder, expected=expected, hint=CALIBRATE)
@@ -80,10 +84,9 @@ def camera_of_numbers(
 
 def find_calibration(folder: Path) -> Path | None:
     """Return the calibration file of a folder, recognised by name; the first in the alphabet."""
-    if not folder.is_dir():
-        return None
-    found = [path for path in folder.iterdir() if _NAME.fullmatch(path.name.lower())]
-    return min(found, default=None)
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    found = (path for name in _NAMES for path in files if re.fullmatch(name, path.name.lower()))
+    return next(found, None)
 
 
 def as_rectified(rig: Rig) -> Rig:

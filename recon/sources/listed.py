@@ -57,7 +57,8 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import disparity_from_depth
-from recon.io.cameras.ros import NS, read_euroc_camera, read_euroc_truth
+from recon.io.cameras.named import read_euroc_camera
+from recon.io.cameras.ros import NS, read_euroc_truth
 from recon.io.files import resolved
 from recon.io.images.image import read_grey_levels
 from recon.io.imu import read_axes, read_imu, read_kalibr_imu

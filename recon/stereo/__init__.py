@@ -7,6 +7,6 @@
 - `match/registry.py`: the matchers by name; ours are `match/sad.py`, `match/sgm.py` and
   `match/fine.py`.
 
-The loops are in `kernels/`. `rectify/` also has what calibration and audit need of cameras: lenses,
-epipolar lines, matched features.
+The loops are in `kernels/`. `rectify/` also has what calibration and audit need of cameras: lenses
+(`rectify/lens.py`, `rectify/closed.py`), epipolar lines, matched features.
 """

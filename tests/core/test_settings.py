@@ -21,7 +21,7 @@ from recon.core.text import (
     with_unit,
 )
 from recon.evaluation.trajectory import TrajectoryRules
-from recon.io.cameras.opencv_yaml import read_file_storage
+from recon.io.cameras.contents import read_contents
 from recon.io.fields import parse_yaml
 from recon.io.files import read_table
 from recon.io.models.ply import read_ply
@@ -76,7 +76,7 @@ def test_readers_take_decimals_alone(tmp_path, reader):
 def test_numbers_of_old_yaml_are_text(tmp_path, text):
     assert parse_yaml(f"value: {text}", "x.yaml") == {"value": text}
     (tmp_path / "rig.yml").write_text(f"%YAML:1.0\n---\nfx: {text}\n", encoding="utf-8")
-    assert read_file_storage(tmp_path / "rig.yml") == {"fx": text}
+    assert read_contents(tmp_path / "rig.yml") == {"fx": text}
     decimals = "[10, 010, -2, 0.5, 1.5e+3, -.inf, true]"
     assert parse_yaml(decimals, "x.yaml") == [10, 10, -2, 0.5, 1500.0, -float("inf"), True]
 

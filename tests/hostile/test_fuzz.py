@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from recon.commands.config import load_config
 from recon.core.values import OccupancyGrid, OccupancyVoxels, PointCloud, StereoPair, TriangleMesh
 from recon.io.cameras.calibration import read_calibration
-from recon.io.cameras.ros import read_euroc_camera, read_euroc_truth
+from recon.io.cameras.named import read_euroc_camera
+from recon.io.cameras.ros import read_euroc_truth
 from recon.io.fields import read_yaml
 from recon.io.images.disparity import read_disparity_png, read_pfm, write_pfm
 from recon.io.images.image import read_image

@@ -14,7 +14,8 @@ from recon.core.errors import CalibrationError, FormatError, ReconError, SourceE
 from recon.core.geometry.se3 import invert, make_transform
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.io.cameras.calibration import write_recon_calibration
-from recon.io.cameras.ros import read_euroc_camera, write_kalibr
+from recon.io.cameras.named import read_euroc_camera
+from recon.io.cameras.ros import write_kalibr
 from recon.io.images.image import write_image
 from recon.sources.images import find_partners, pair_images
 from recon.sources.kitti import open_kitti

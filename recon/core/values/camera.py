@@ -16,7 +16,24 @@ from numpy.typing import NDArray
 from recon.core.errors import CalibrationError
 from recon.core.values.arrays import Float32, Float64, freeze
 
-LensModel = Literal["pinhole", "fisheye"]
+LensModel = Literal["pinhole", "fisheye", "ds", "eucm", "fov", "omni"]
+#: Names of the coefficients of each lens model, in their order.
+LENS_COEFFICIENTS: Final[dict[LensModel, tuple[str, ...]]] = {
+    "pinhole": (
+        "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty",
+    ),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+    "ds": ("xi", "alpha"),
+    "eucm": ("alpha", "beta"),
+    "fov": ("w",),
+    "omni": ("xi", "k1", "k2", "p1", "p2"),
+}  # fmt: skip
+_WITHIN: Final[dict[LensModel, tuple[tuple[float, float], ...]]] = {  # of the first coefficients
+    "ds": ((-1.0, 1.0), (0.0, 1.0)),
+    "eucm": ((0.0, 1.0), (1e-3, 1e3)),
+    "fov": ((0.0, 3.1),),
+    "omni": ((0.0, 100.0),),
+}
 
 #: Of a principal point from the image centre, in image sizes, by which a calibration may still be
 #: of these images: at half the calibrated size it is 0.5.
@@ -35,9 +52,10 @@ class CameraIntrinsics:
     Attributes:
         matrix: float64 (3, 3), the camera matrix in pixels; pixel centres are at integers.
         distortion: float64 (N,). Pinhole: OpenCV's order (k1 k2 p1 p2 k3 …), empty = none;
-            fisheye: always four (k1 k2 k3 k4).
+            the others: all of `LENS_COEFFICIENTS`.
         model: ``pinhole`` projects by the tangent of the angle to the optical axis, ``fisheye``
-            by the angle itself (also called equidistant, or Kannala-Brandt).
+            by the angle itself (also called equidistant, or Kannala-Brandt), ``ds`` by two spheres,
+            ``eucm`` by an ellipsoid, ``fov`` by its angle w, ``omni`` by a mirror (Mei).
     """
 
     matrix: Float64
@@ -57,10 +75,15 @@ class CameraIntrinsics:
             raise CalibrationError("camera matrix is not that of a lens", got=self.matrix.tolist())
         if np.abs(self.distortion).max(initial=0.0) > _MOST_DISTORTION:
             raise CalibrationError("distortion is implausible", got=self.distortion.tolist())
-        if self.model == "fisheye" and self.distortion.size != 4:
-            raise CalibrationError(
-                "a fisheye camera has four distortion coefficients", got=self.distortion.size
-            )
+        names = LENS_COEFFICIENTS[self.model]
+        if self.model != "pinhole" and self.distortion.size != len(names):
+            what = f"the lens model {self.model} has other coefficients"
+            raise CalibrationError(what, got=self.distortion.size, expected=" ".join(names))
+        limits = _WITHIN.get(self.model, ())
+        for name, value, (least, most) in zip(names, self.distortion, limits, strict=False):
+            if not least <= value <= most:
+                what = f"{name} of the lens model {self.model} is implausible"
+                raise CalibrationError(what, got=f"{value:g}", expected=f"{least:g} to {most:g}")
 
     def __repr__(self) -> str:
         (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()

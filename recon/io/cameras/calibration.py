@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Final, cast
-from zipfile import is_zipfile
 
 import numpy as np
 import yaml
 
 from recon.core.errors import CalibrationError, FormatError
 from recon.core.geometry.se3 import make_transform
-from recon.core.text import parse_number
 from recon.core.values import (
+    LENS_COEFFICIENTS,
     CameraIntrinsics,
     LensModel,
     RectifiedCamera,
@@ -23,9 +23,10 @@ from recon.core.values import (
     check_size,
 )
 from recon.io.atomic import write_text
+from recon.io.cameras.contents import BINARY
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
-from recon.io.cameras.opencv_yaml import INSTEAD, read_opencv_calibration
-from recon.io.cameras.ros import in_options, pinhole_matrix, read_camera_info, read_kalibr
+from recon.io.cameras.named import INSTEAD, read_named
+from recon.io.cameras.ros import pinhole_matrix, read_camera_info
 from recon.io.fields import Fields, read_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.io.middlebury import read_middlebury_calib
@@ -36,12 +37,6 @@ _HEADER: Final = """\
 # Pixel centres are at integers; camera axes: x right, y down, z forward.
 # xyz_right = rotation * xyz_left + translation_m
 """
-_NAMES: Final[dict[str, tuple[str, ...]]] = {  # of coefficients, by lens model
-    "pinhole": (
-        "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty",
-    ),
-    "fisheye": ("k1", "k2", "k3", "k4"),
-}  # fmt: skip
 _RECTIFIED: Final = ("focal_px", "cx_px", "cy_px", "cx_right_px", "baseline_m")
 
 
@@ -104,16 +99,18 @@ def _camera_content(camera: CameraIntrinsics) -> dict[str, Any]:
         "width_px": camera.width_px,
         "height_px": camera.height_px,
         **{name: float(value) for name, value in pinhole.items()},
-        "distortion": dict(zip(_NAMES[camera.model], camera.distortion.tolist(), strict=False)),
+        "distortion": dict(
+            zip(LENS_COEFFICIENTS[camera.model], camera.distortion.tolist(), strict=False)
+        ),
     }
 
 
 def _read_camera(fields: Fields) -> CameraIntrinsics:
     model = cast("LensModel", fields.text("model"))
-    if model not in _NAMES:
-        raise FormatError("unknown lens model", got=model, expected="pinhole or fisheye")
+    if model not in LENS_COEFFICIENTS:
+        raise FormatError("unknown lens model", got=model, expected=", ".join(LENS_COEFFICIENTS))
     fx, fy, cx, cy = (fields.number(name) for name in ("fx_px", "fy_px", "cx_px", "cy_px"))
-    given, names = fields.below("distortion"), _NAMES[model]
+    given, names = fields.below("distortion"), LENS_COEFFICIENTS[model]
     known = [name for name in names if name in given]
     if known != list(names[: len(known)]):
         raise FormatError("distortion has gaps", got=", ".join(known), expected=", ".join(names))
@@ -123,22 +120,18 @@ def _read_camera(fields: Fields) -> CameraIntrinsics:
 
 
 _COMMA, _POINT = re.compile(r"\d,\d"), re.compile(r"^[^%<\n]*\d\.", re.MULTILINE)
-#: Numbers of rectified cameras in the settings of ORB-SLAM.
-_ORB_SLAM: Final = re.compile(r"^(?:Camera1?|Stereo)\.(fx|cx|cy|bf|b):\s*(\S+)", re.MULTILINE)
-#: What a file of each format contains. OpenCV's comes after the others that may have its header,
-#: and before KITTI's: it may contain a ``P1:``.
+#: What a text of a format contains that has other rules than names and shapes. Files of OpenCV may
+#: contain a ``P1:``, too: KITTI's comes after them.
 _SIGNS: Final = {
     "recon": re.compile(rf"^format:\s*{MARK}", re.MULTILINE),
     "ros": re.compile(r"^projection_matrix:", re.MULTILINE),
-    "kalibr": re.compile(r"^cam0:", re.MULTILINE),
-    "opencv": re.compile(r"^%YAML|<opencv_storage>|opencv-matrix"),
+    "": re.compile(r"^%YAML|<opencv_storage>|opencv-matrix"),
     "middlebury": re.compile(r"^\s*cam[01]\s*=", re.MULTILINE),
     "kitti": re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE | re.ASCII),
     "homographies": re.compile(r"^H_left:", re.MULTILINE),
 }
 _READERS: Final[dict[str, Callable[[StrPath], Rig]]] = {
     "recon": read_recon_calibration,
-    "kalibr": read_kalibr,
     "middlebury": lambda path: read_middlebury_calib(path).camera,
 }
 
@@ -166,31 +159,21 @@ def read_calibration(
         CalibrationError: It cannot give depth, or is of another image size.
     """
     size = None if width_px is None or height_px is None else (width_px, height_px)
-    if is_zipfile(path):
-        raise FormatError("arrays of NumPy are not a calibration file", hint=INSTEAD)
-    text = read_text(path, SMALL_FILE_BYTES)
-    if _COMMA.search(text) and not _POINT.search(text):
-        raise FormatError("decimals are written with a comma", expected="a point, as 0.5")
-    _refuse_numbers(text)
-    form = next((form for form, sign in _SIGNS.items() if sign.search(text)), "")
-    if form == "opencv":
-        rig: Rig = read_opencv_calibration(path, size_px=size, metres_per_unit=metres_per_unit)
-    elif form == "kitti":
-        rig = _read_kitti(path, size, cameras)
+    form = _form(path)
+    if form == "kitti":
+        rig: Rig | None = _read_kitti(path, size, cameras)
     elif form == "ros":
         rig = read_camera_info(path, size)
     elif form in _READERS:
         rig = _READERS[form](path)
-    elif form == "homographies":
-        what = "homographies know no focal length and no baseline: there is no depth in them"
-        use = "for depth use a calibration of the cameras (recon calibrate)"
-        hint = f"recon disparity takes the rectified images as they are; {use}"
-        raise CalibrationError(what, hint=hint)
     else:
+        rig = read_named(path, size, metres_per_unit=metres_per_unit)
+    if rig is None:
         raise FormatError(
             "not a calibration file of a known kind",
-            expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), "
-            "OpenCV YAML/XML/JSON (M1 …, or P1 P2), ROS CameraInfo or a kalibr camchain (cam0: …)",
+            expected="our YAML, KITTI calib.txt (P0: …), Middlebury calib.txt (cam0=…), OpenCV "
+            "YAML/XML/JSON or arrays of NumPy (K1 …, or P1 P2), MATLAB .mat, ROS CameraInfo, a "
+            "kalibr camchain (cam0: …), a ZED's .conf, settings of ORB-SLAM or VINS",
             hint=INSTEAD,
         )
     if isinstance(rig, StereoCalibration):
@@ -212,15 +195,21 @@ def write_calibration(path: StrPath, calibration: Rig) -> None:
     write_recon_calibration(path, calibration)
 
 
-def _refuse_numbers(text: str) -> None:
-    """Refuse settings of ORB-SLAM, whose cameras are numbers that options take."""
-    found = dict(_ORB_SLAM.findall(text))
-    if {"fx", "cx", "cy"} < found.keys() and found.keys() & {"b", "bf"}:
-        fx, cx, cy = (parse_number(found[name]) for name in ("fx", "cx", "cy"))
-        baseline_m = parse_number(found["b"]) if "b" in found else parse_number(found["bf"]) / fx
-        what = "not a calibration of raw cameras, but numbers of rectified ones"
-        given = f"if the images are rectified give {in_options(fx, baseline_m, cx, cy)}"
-        raise FormatError(what, hint=f"{given}; else calibrate both cameras as a pair")
+def _form(path: StrPath) -> str:
+    """Return the name of a format that has a sign of its own; the others are known by names."""
+    with Path(path).open("rb") as file:
+        if b"\0" in file.read(128) or Path(path).suffix in BINARY:
+            return ""
+    text = read_text(path, SMALL_FILE_BYTES)
+    if _COMMA.search(text) and not _POINT.search(text):
+        raise FormatError("decimals are written with a comma", expected="a point, as 0.5")
+    form = next((form for form, sign in _SIGNS.items() if sign.search(text)), "")
+    if form == "homographies":
+        what = "homographies know no focal length and no baseline: there is no depth in them"
+        use = "for depth use a calibration of the cameras (recon calibrate)"
+        hint = f"recon disparity takes the rectified images as they are; {use}"
+        raise CalibrationError(what, hint=hint)
+    return form
 
 
 def _read_kitti(

@@ -45,12 +45,8 @@ _KALIBR_MODELS: Final[Models] = {
     "equidistant": ("fisheye", (4,)),
     "none": ("pinhole", (0,)),
 }
-_EUROC_MODELS: Final[Models] = {
-    "radial-tangential": ("pinhole", (4, 5)),
-    "equidistant": ("fisheye", (4,)),
-}
 NS: Final = 1e-9
-_AGAIN: Final = "calibrate again with one of these; equidistant is for wide lenses"
+AGAIN: Final = "calibrate again with one of these; equidistant is for wide lenses"
 _SIDES: Final = ("left", "right")
 _OFF_CENTRE: Final = 0.05  # of a principal point, in image sizes: hardly a lens is mounted worse
 
@@ -198,31 +194,6 @@ def _matrix(values: NDArray[Any]) -> dict[str, Any]:
     return {"rows": rows, "cols": columns, "data": values.ravel().tolist()}
 
 
-@reader
-def read_kalibr(path: StrPath) -> StereoCalibration:
-    """Read kalibr's camera chain; ``T_cn_cnm1`` maps points of camera n-1 to camera n."""
-    fields, cameras = Fields(read_yaml(path)), []
-    T_right_left = fields.below("cam1").numbers("T_cn_cnm1", (4, 4))
-    check_rotation(T_right_left[:3, :3], "T_cn_cnm1")
-    for part in (fields.below("cam0"), fields.below("cam1")):
-        if (kind := part.text("camera_model")) != "pinhole":
-            expected = "pinhole (with radtan or equidistant distortion)"
-            what = "camera model is not supported"
-            raise FormatError(what, got=kind, expected=expected, hint=_AGAIN)
-        name = part.text("distortion_model")
-        cameras.append(_camera(part, _KALIBR_MODELS, name, "distortion_coeffs", path))
-    return StereoCalibration(cameras[0], cameras[1], orthonormalise(T_right_left))
-
-
-def _camera(
-    fields: Fields, models: Models, name: str, coefficients: str, path: StrPath
-) -> CameraIntrinsics:
-    model, distortion = lens_of(models, name, fields.numbers(coefficients), path)
-    width, height = fields.numbers("resolution", (2,))
-    matrix = pinhole_matrix(*fields.numbers("intrinsics", (4,)))
-    return CameraIntrinsics(matrix, distortion, int(width), int(height), model)
-
-
 def write_kalibr(path: StrPath, calibration: StereoCalibration) -> None:
     """Write a camera chain atomically."""
     chain: dict[str, Any] = {}
@@ -240,18 +211,6 @@ def write_kalibr(path: StrPath, calibration: StereoCalibration) -> None:
         }
     chain["cam1"]["T_cn_cnm1"] = calibration.T_right_left.tolist()
     write_text(path, yaml.safe_dump(chain, default_flow_style=None))
-
-
-@reader
-def read_euroc_camera(path: StrPath) -> tuple[CameraIntrinsics, Float64]:
-    """Read a camera from its ``sensor.yaml``, and ``T_body_camera`` (4, 4), metres."""
-    fields = Fields(read_yaml(path))
-    key = "distortion_model"
-    name = fields.text(key) if key in fields else "radial-tangential"
-    camera = _camera(fields, _EUROC_MODELS, name, "distortion_coefficients", path)
-    T = fields.below("T_BS").numbers("data", (4, 4))
-    check_rotation(T[:3, :3], "T_BS")
-    return camera, make_transform(T[:3, :3], T[:3, 3])
 
 
 @reader
@@ -280,7 +239,7 @@ def lens_of(
     if name not in models:
         expected = ", ".join(models)
         what = "lens model is not supported"
-        raise FormatError(what, where=where, got=name, expected=expected, hint=_AGAIN)
+        raise FormatError(what, where=where, got=name, expected=expected, hint=AGAIN)
     model, counts = models[name]
     if coefficients.size not in counts:
         what = f"lens model {name!r} has the wrong number of coefficients"

@@ -1,4 +1,4 @@
-"""Raw cameras: one interface to OpenCV's two lens models, and the epipolar curves they make."""
+"""Raw cameras: one interface to all lens models, and the epipolar curves they make."""
 
 from __future__ import annotations
 
@@ -11,17 +11,29 @@ from numpy.typing import NDArray
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.arrays import Float32, Float64
+from recon.stereo.rectify.closed import CLOSED_FORMS, EXACT
 
 _ORIGIN: Final = np.zeros(3)
 _LARGEST_MISS_PX: Final = 0.01  # largest reprojection error of a correctly inverted ray
 
-# OpenCV inverts a lens model iteratively, and stops early by default (five iterations, 0.01).
-_EXACT: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-13)
-
 
 def project_raw(camera: CameraIntrinsics, xyz: NDArray[Any]) -> Float64:
     """Return float64 (N, 2), pixels of points (N, 3) in camera axes; NaN at or behind its plane."""
-    return project_with_jacobian(camera, xyz)[0]
+    if camera.model not in CLOSED_FORMS:
+        return project_with_jacobian(camera, xyz)[0]
+    points = np.asarray(xyz, dtype=np.float64).reshape(-1, 3)
+    with np.errstate(all="ignore"):
+        plane = CLOSED_FORMS[camera.model][0](camera.distortion, points)
+    pixels = plane @ camera.matrix[:2, :2].T + camera.matrix[:2, 2]
+    return np.asarray(np.where(points[:, 2:] > 0, pixels, np.nan))
+
+
+def central_focal_px(camera: CameraIntrinsics) -> float:
+    """Return the resolution at the optical axis, in pixels per radian along a row."""
+    if camera.model not in CLOSED_FORMS:
+        return float(camera.matrix[0, 0])
+    at, step = np.array([[0, 0, 1.0], [1e-6, 0, 1.0]]), 1e-6
+    return float(np.diff(project_raw(camera, at)[:, 0])[0] / step)
 
 
 def project_with_jacobian(
@@ -30,7 +42,7 @@ def project_with_jacobian(
     """Project points (N, 3) in camera axes to pixels (N, 2), NaN at or behind the camera's plane.
 
     With their Jacobians by the point, (N, 2, 3), and by (fx, fy, cx, cy, distortion …),
-    (N, 2, 4 + D).
+    (N, 2, 4 + D). Of OpenCV's lens models alone: pinhole and fisheye.
     """
     points = np.ascontiguousarray(xyz, dtype=np.float64).reshape(-1, 1, 3)
     matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
@@ -72,8 +84,13 @@ def rays_of(camera: CameraIntrinsics, pixels: NDArray[Any]) -> Float64:
     matrix, distortion = np.array(camera.matrix), np.array(camera.distortion)
     if not len(points):
         return np.zeros((0, 3))
+    if camera.model in CLOSED_FORMS:
+        plane = (points[:, 0] - matrix[:2, 2]) @ np.linalg.inv(matrix[:2, :2]).T
+        with np.errstate(all="ignore"):
+            rays = CLOSED_FORMS[camera.model][1](distortion, plane)
+            return np.asarray(np.where(rays[:, 2:] > 0, rays / rays[:, 2:], np.nan))
     model: Any = cv2.fisheye if camera.model == "fisheye" else cv2
-    plane = model.undistortPoints(points, matrix, distortion, criteria=_EXACT)
+    plane = model.undistortPoints(points, matrix, distortion, criteria=EXACT)
     rays = np.concatenate([plane.reshape(-1, 2), np.ones((len(points), 1))], axis=1)
     # OpenCV marks some failures of the fisheye model with -1e6; of other failures, and of rays at
     # more than 90 degrees, it returns the ray of another pixel.
@@ -105,8 +122,8 @@ def rectifying_maps(
     ``rotation`` is from camera axes to those of the view, ``matrix`` (3, 3) or (3, 4) its pinhole
     matrix, ``size`` its (width, height).
     """
-    if camera.model != "fisheye" and not sees_all(camera):
-        # The lens model folds back into the image: where it does, the tables are (-1, -1).
+    if camera.model in CLOSED_FORMS or (camera.model == "pinhole" and not sees_all(camera)):
+        # The lens model may end, or fold back into the image: there the tables are (-1, -1).
         x, y = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
         rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)]).astype(np.float64)
         xyz = (np.linalg.inv(rotation) @ np.linalg.inv(matrix[:, :3]) @ rays).T

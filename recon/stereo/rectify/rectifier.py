@@ -26,7 +26,13 @@ from recon.core.values import (
     check_size,
 )
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8, frozen_array
-from recon.stereo.rectify.lens import border_of, rays_of, rectifying_maps, sees_all
+from recon.stereo.rectify.lens import (
+    border_of,
+    central_focal_px,
+    rays_of,
+    rectifying_maps,
+    sees_all,
+)
 
 # Allows for rounding in identity maps; far below the resolution of the interpolation (1/32 px).
 _BORDER_TOLERANCE_PX: Final = 1e-3
@@ -142,7 +148,8 @@ def plan_turns(calibration: StereoCalibration, settings: RectificationSettings) 
     left, right = calibration.left, calibration.right
     size = (left.width_px, left.height_px)
     try:
-        if "fisheye" in (left.model, right.model) or not (sees_all(left) and sees_all(right)):
+        flat = {left.model, right.model} == {"pinhole"}
+        if not (flat and sees_all(left) and sees_all(right)):
             R1, R2, P1, P2 = plan_wide_view(calibration, settings.alpha)
         else:
             alpha = -1 if settings.alpha is None else settings.alpha
@@ -203,12 +210,13 @@ def _with_field(camera: RectifiedCamera, field_of_view_deg: float | None) -> Rec
 
 
 def _check_focal(camera: RectifiedCamera, raw: CameraIntrinsics) -> None:
-    ratio = camera.focal_px / float(raw.matrix[0, 0])
+    usual_px = central_focal_px(raw)
+    ratio = camera.focal_px / usual_px
     if not 1 / _OUT_OF_PROPORTION < ratio < _OUT_OF_PROPORTION:
         raise CalibrationError(
             "the rectified views came out with a focal length out of all proportion",
             got=f"{camera.focal_px:.4g} px",
-            expected=f"about {raw.matrix[0, 0]:.4g} px as in the raw images",
+            expected=f"about {usual_px:.4g} px as in the raw images",
             hint="check the distortion coefficients; if they are right, this is an error of recon: "
             "please report it with the calibration",
         )
@@ -250,7 +258,7 @@ def plan_wide_view(calibration: StereoCalibration, alpha: float | None) -> Seque
     R_left, R_right, P_left, P_right = _bouguet(calibration, None, None, -1)
     boxes = np.array([_boxes(left, R_left), _boxes(right, R_right)])
     inner, outer = zip(boxes[:, :, 0].max(axis=0), boxes[:, :, 1].min(axis=0), strict=True)
-    focal = raw_px = float(left.matrix[0, 0])
+    focal = raw_px = central_focal_px(left)
     if alpha is not None:
         pixels = np.array(size) - 1.0
         zoomed = max(raw_px, float((pixels / np.maximum(inner[1] - inner[0], 1e-6)).max()))
