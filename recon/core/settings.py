@@ -101,7 +101,8 @@ class Settings(BaseModel):
     def at_scale(self, scale: float) -> Self:
         """Return settings in which a `Length` that is not set is that of a road times ``scale``.
 
-        A reach grows with the root of the error that it may have (`doublings_at`). All of them are set then, so that another scale changes nothing any more.
+        A reach grows with the root of the error that it may have (`doublings_at`). All of them are
+        set then, so that another scale changes nothing any more.
         """
         found: dict[str, Any] = {}
         for name, field in type(self).model_fields.items():

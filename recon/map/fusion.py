@@ -43,28 +43,34 @@ class FusionSettings(Settings):
     written to map/removed.ply. What left before a plain wall, which no ray reaches, is taken out of
     occupancy and grid, too."""
 
+    @property
+    def largest_voxel_m(self) -> float:
+        """Edge of a voxel where depth is least certain."""
+        return self.voxel_m * 2.0 ** (self.doublings or 0)
 
-def nominal_error_m(depth_m: NDArray[Any], camera: RectifiedCamera) -> Float64:
-    """Return the error (N,) that 0.3 px make at depths (N,): ``Z²·error_px / (f·b)``."""
-    fb = camera.focal_px * camera.baseline_m
-    return np.asarray(depth_m, np.float64) ** 2 * (_NOMINAL_ERROR_PX / fb)
+
+def nominal_error_m(depth_m: float, camera: RectifiedCamera) -> float:
+    """Return the error that 0.3 px make at a depth: ``Z²·error_px / (f·b)``."""
+    return depth_m**2 * _NOMINAL_ERROR_PX / (camera.focal_px * camera.baseline_m)
 
 
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
     """Return the depth up to which points are fused."""
     if settings.max_depth_error_m is None:
         return math.inf
-    most_m = settings.max_depth_error_m * 2 ** (settings.doublings or 0)
-    return math.sqrt(most_m / float(nominal_error_m(np.ones(1), camera)[0]))
+    most_m = settings.max_depth_error_m * 2.0 ** (settings.doublings or 0)
+    return math.sqrt(most_m / nominal_error_m(1.0, camera))
 
 
 def voxel_doublings(
-    depth_m: NDArray[Any], camera: RectifiedCamera, settings: FusionSettings
+    depth_m: NDArray[np.floating], camera: RectifiedCamera, settings: FusionSettings
 ) -> UInt8:
     """Return uint8 (N,), how often voxels are doubled for points at depths (N,)."""
     if not settings.doublings or settings.max_depth_error_m is None:
         return np.zeros(len(depth_m), np.uint8)
-    times = nominal_error_m(depth_m, camera) / settings.max_depth_error_m
+    times = (
+        nominal_error_m(1.0, camera) / settings.max_depth_error_m * depth_m.astype(np.float64) ** 2
+    )
     return np.ceil(np.log2(np.clip(times, 1.0, 2.0**settings.doublings))).astype(np.uint8)
 
 

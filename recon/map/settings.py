@@ -138,7 +138,7 @@ class DriveSettings(StereoSettings):
         if radius_m is None or not doublings or cloud.sigma_m is None or cloud.count is None:
             return radius_m
         frame_sigma = cloud.sigma_m * np.sqrt(cloud.count) / self.fusion.voxel_m
-        return radius_m * 2.0 ** np.clip(np.ceil(np.log2(frame_sigma)), 0, doublings)
+        return np.asarray(radius_m * 2.0 ** np.clip(np.ceil(np.log2(frame_sigma)), 0, doublings))
 
     def with_odometry(self, odometry: str | Odometry) -> Self:
         """Return the settings with another odometry, by name or as an object.

@@ -107,7 +107,7 @@ def read_pair_input(
     calibration: Path | None,
     *,
     known: SourceSettings | None = None,
-    metres_per_unit: float = 1.0,
+    metres_per_unit: float | None = None,
     max_megapixels: float = MAX_MEGAPIXELS,
 ) -> PairInput:
     """Read two images with their calibration; without one the pair is rectified.

@@ -63,13 +63,14 @@ Nodes = dict[str, Float64 | str]
 
 @reader
 def read_opencv_calibration(
-    path: StrPath, *, size_px: tuple[int, int] | None = None, metres_per_unit: float = 1.0
+    path: StrPath, *, size_px: tuple[int, int] | None = None, metres_per_unit: float | None = None
 ) -> Rig:
     """Read two raw cameras (``M1 D1 M2 D2``, or ``cameraMatrix1`` …) and their pose (``R T``).
 
     Of OpenCV's pair of files, ``intrinsics`` without ``R``, the ``extrinsics`` beside are read,
     too. A file of ``P1`` and ``P2`` alone is of rectified images. ``size_px`` (width, height) is
-    for files that do not state it; ``metres_per_unit`` is the unit of ``T``.
+    for files that do not state it; ``metres_per_unit`` is the unit of ``T``; None = metres,
+    of a baseline that a rig may have.
     """
     nodes = read_file_storage(path)
     stated = _size(nodes)
@@ -104,30 +105,31 @@ def read_opencv_calibration(
     with reading(outer):
         outer_nodes = read_file_storage(outer)
         rotation = _matrix(outer_nodes, _ROTATION, (3, 3))
-        translation_m = _matrix(outer_nodes, _TRANSLATION, (3,)) * metres_per_unit
+        translation_m = _matrix(outer_nodes, _TRANSLATION, (3,)) * (metres_per_unit or 1.0)
         calibration = StereoCalibration(left, right, make_transform(rotation, translation_m))
-        _check_unit(calibration.baseline_m)
+        _check_unit(calibration.baseline_m, metres_per_unit)
     return calibration
 
 
 def _rectified(
-    nodes: Nodes, size: tuple[int, int], metres_per_unit: float, unsized: StrPath | None
+    nodes: Nodes, size: tuple[int, int], metres_per_unit: float | None, unsized: StrPath | None
 ) -> RectifiedCamera:
     found = {name: _matrix(nodes, (name,), (3, 4)).copy() for name in sorted(_PROJECTIONS)}
     for matrix in found.values():
-        matrix[:, 3] *= metres_per_unit
+        matrix[:, 3] *= metres_per_unit or 1.0
     if unsized is not None:
         check_unsized((found["P1"][0, 2], found["P1"][1, 2]), *size, unsized)
     camera = projected_rig(found, *size)
-    _check_unit(camera.baseline_m)
+    _check_unit(camera.baseline_m, metres_per_unit)
     return camera
 
 
-def _check_unit(baseline_m: float) -> None:
-    if baseline_m > _LONGEST_BASELINE_M:
+def _check_unit(baseline_m: float, metres_per_unit: float | None) -> None:
+    if metres_per_unit is None and baseline_m > _LONGEST_BASELINE_M:
         what = "baseline is implausibly long"
         got, expected = f"{baseline_m:g} m", f"at most {_LONGEST_BASELINE_M:g} m"
-        hint = "in millimetres? --set source.metres_per_unit=0.001, in Python metres_per_unit=0.001"
+        hint = "in millimetres? --set source.metres_per_unit=0.001 (1 if it is right), in Python "
+        hint += "metres_per_unit=0.001"
         raise CalibrationError(what, got=got, expected=expected, hint=hint)
 
 
