@@ -61,11 +61,12 @@ class UsualProducts(Figures):
             mesh=made.figures_of(MeshFigures) if "mesh" in made.made else MeshFigures(),
         )
 
-    def rows(self, reach: str = "") -> Rows:
+    def rows(self) -> Rows:
+        faces = counted(self.mesh.faces, "face", form=",")
+        mesh = f"; {WHOLE} {faces}" if self.mesh.faces else ""
         return [
-            ("cloud", PRODUCTS["cloud"].name, self.cloud.text + reach),
+            ("cloud", PRODUCTS["cloud"].name, self.cloud.text + mesh),
             ("grid", PRODUCTS["grid"].name, self.grid.text),
-            *([("mesh", WHOLE, self.mesh.text)] if self.mesh.faces else []),
         ]
 
 
@@ -124,7 +125,8 @@ class MapSummary(RunSummary):
         return [
             (f"map of {counted(self.frames, 'frame')}{doubted}, {path}",),
             *self.folder_row(),
-            *self.made.rows(self._reach()),
+            ("maps", self._reach()),
+            *self.made.rows(),
             *(self._accuracy() or self._base()),
             *self.cost_row(*rate, *poses),
             ("next", self.open_view()),
@@ -134,9 +136,9 @@ class MapSummary(RunSummary):
         near, far = length(self.voxel_m), length(self.largest_voxel_m)
         voxels = f"voxels of {near}" + ("" if near == far else f" to {far}")
         if not math.isfinite(self.reach_m):
-            return f", {voxels}"
+            return f"all depths, {voxels}"
         at = length(self.reach_m)
-        return f", maps up to {at}, {voxels}, ± {length(self.reach_error_m)} at {at}"
+        return f"up to {at}, {voxels}, ± {length(self.reach_error_m)} at {at}"
 
     def _accuracy(self) -> Rows:
         """Return how far path and surface are off the truth, as far as that is known."""
