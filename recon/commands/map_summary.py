@@ -62,11 +62,10 @@ class UsualProducts(Figures):
         )
 
     def rows(self) -> Rows:
-        faces = counted(self.mesh.faces, "face", form=",")
-        mesh = f"; {WHOLE} {faces}" if self.mesh.faces else ""
         return [
-            ("cloud", PRODUCTS["cloud"].name, self.cloud.text + mesh),
+            ("cloud", PRODUCTS["cloud"].name, self.cloud.text),
             ("grid", PRODUCTS["grid"].name, self.grid.text),
+            *([("mesh", WHOLE, self.mesh.text)] if self.mesh.faces else []),
         ]
 
 
@@ -122,12 +121,15 @@ class MapSummary(RunSummary):
         live = self.read.live
         time_offset_ms = None if live is None else live.latency_ms.p95
         poses = () if time_offset_ms is None else (f"95 % of poses in {time_offset_ms:.0f} ms",)
+        made, accuracy = self.made.rows(), self._accuracy() or self._base()
+        # Eight lines: the last one names the folder, too.
+        full = bool(self.made.mesh.faces and accuracy)
         return [
             (f"map of {counted(self.frames, 'frame')}{doubted}, {path}",),
-            *self.folder_row(),
+            *([] if full else self.folder_row()),
             ("maps", self._reach()),
-            *self.made.rows(),
-            *(self._accuracy() or self._base()),
+            *made,
+            *accuracy,
             *self.cost_row(*rate, *poses),
             ("next", self.open_view()),
         ]
