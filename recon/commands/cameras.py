@@ -127,7 +127,7 @@ def run_rectify(
     config: ReconConfig,
     *,
     calibration: Path | None = None,
-    metres_per_unit: float = 1.0,
+    metres_per_unit: float | None = None,
     out: Path | None = None,
     threads: int | None = None,
 ) -> RectifyResult:

@@ -326,8 +326,8 @@ _INTRODUCTION: Final = (
     "Every setting, as `recon settings` lists them. Change one with `--set name=value`, several in "
     "a YAML file given as `--config FILE`; the `config.yaml` in the folder of a run has those that "
     "were in effect. `none` is a value where it says so. `× scale`: that on a road, times "
-    "`scene.scale`. (pair: …) is the default of `recon pair` and `recon disparity` where it "
-    "differs."
+    "`scene.scale`; `× scale+`: up to twice that in small scenes. (pair: …) is the default "
+    "of `recon pair` and `recon disparity` where it differs."
 )
 _BOUNDS: Final = {"ge": "≥", "gt": ">", "le": "≤", "lt": "<"}
 _PLAIN: Final = {bool: "true, false", str: "text", int: "whole number", float: "number"}
@@ -347,13 +347,13 @@ class SettingEntry:
     unit: str
     values: str
     description: str
-    follows_scene: bool = False
+    follows_scene: str = ""
 
     @property
     def shown_default(self) -> str:
         """The default with its unit, and that of a pair where it differs."""
         unit = f" {self.unit}" if self.unit and self.default != "none" else ""
-        unit += " × scale" * self.follows_scene
+        unit += " × scale" * bool(self.follows_scene) + "+" * (self.follows_scene == "reach")
         differs = self.default_pair != self.default
         return f"{self.default}{unit}" + (f" (pair: {self.default_pair})" if differs else "")
 

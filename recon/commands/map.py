@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -38,6 +39,7 @@ from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import doubt_poses
 from recon.map.drive.scale import SceneScale, measure_scene
 from recon.map.drive.sequence import MappedSequence, break_warnings, check_map, map_sequence
+from recon.map.fusion import fusion_range_m, nominal_error_m
 from recon.map.map import Map
 from recon.map.sessions.copying import keep_map
 from recon.map.store.map_file import MAP_FILE
@@ -344,6 +346,8 @@ def _summary(
     warnings: list[str],
 ) -> MapSummary:
     frames, prior, given = len(mapped.trajectory), mapped.prior, options.known_poses is not None
+    reach_m = fusion_range_m(mapped.camera, mapped.config.fusion)
+    reach_m = min(reach_m, mapped.config.cloud.max_range_m or math.inf)
     return MapSummary(
         odometry="known poses" if given else name_of(mapped.config.odometry.method),
         source=source.name,
@@ -360,6 +364,9 @@ def _summary(
         T_map_world=mapped.T_map_world,
         scale=mapped.config.scale,
         voxel_m=mapped.config.fusion.voxel_m,
+        largest_voxel_m=mapped.config.fusion.largest_voxel_m,
+        reach_m=reach_m,
+        reach_error_m=nominal_error_m(reach_m, mapped.camera),
         typical_depth_m=depth_m,
         made=UsualProducts.of(made),
         rig=rig.figures(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from recon.core.summary import (
     optional,
     shown_path,
 )
-from recon.core.text import counted, metres
+from recon.core.text import counted, length, metres
 from recon.core.values import MapMetrics, OccupancyMetrics, TrajectoryMetrics
 from recon.core.values.arrays import Float64
 from recon.export.cloud import CloudFigures
@@ -60,10 +61,9 @@ class UsualProducts(Figures):
             mesh=made.figures_of(MeshFigures) if "mesh" in made.made else MeshFigures(),
         )
 
-    def rows(self, voxel_m: float | None = None) -> Rows:
-        voxels = "" if voxel_m is None else f", voxels of {voxel_m:g} m"
+    def rows(self) -> Rows:
         return [
-            ("cloud", PRODUCTS["cloud"].name, self.cloud.text + voxels),
+            ("cloud", PRODUCTS["cloud"].name, self.cloud.text),
             ("grid", PRODUCTS["grid"].name, self.grid.text),
             *([("mesh", WHOLE, self.mesh.text)] if self.mesh.faces else []),
         ]
@@ -96,6 +96,9 @@ class MapSummary(RunSummary):
     T_map_world: Float64  # (4, 4)
     scale: float  # that lengths of the settings were multiplied by
     voxel_m: float
+    largest_voxel_m: float  # far away
+    reach_m: float  # depth up to which points are fused; infinite = any
+    reach_error_m: float  # of a depth there, in one frame, by a matching error of 0.3 px
     typical_depth_m: float | None
     made: UsualProducts = inline()
     rig: RigFigures
@@ -118,14 +121,26 @@ class MapSummary(RunSummary):
         live = self.read.live
         time_offset_ms = None if live is None else live.latency_ms.p95
         poses = () if time_offset_ms is None else (f"95 % of poses in {time_offset_ms:.0f} ms",)
+        made, accuracy = self.made.rows(), self._accuracy() or self._base()
+        # Eight lines: the last one names the folder, too.
+        full = bool(self.made.mesh.faces and accuracy)
         return [
             (f"map of {counted(self.frames, 'frame')}{doubted}, {path}",),
-            *self.folder_row(),
-            *self.made.rows(self.voxel_m),
-            *(self._accuracy() or self._base()),
+            *([] if full else self.folder_row()),
+            ("maps", self._reach()),
+            *made,
+            *accuracy,
             *self.cost_row(*rate, *poses),
             ("next", self.open_view()),
         ]
+
+    def _reach(self) -> str:
+        near, far = length(self.voxel_m), length(self.largest_voxel_m)
+        voxels = f"voxels of {near}" + ("" if near == far else f" to {far}")
+        if not math.isfinite(self.reach_m):
+            return f"all depths, {voxels}"
+        at = length(self.reach_m)
+        return f"up to {at}, {voxels}, ± {length(self.reach_error_m)} at {at}"
 
     def _accuracy(self) -> Rows:
         """Return how far path and surface are off the truth, as far as that is known."""

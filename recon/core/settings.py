@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from types import UnionType
 from typing import Any, Final, Union, get_args, get_origin
@@ -22,15 +23,16 @@ from typing_extensions import Self
 from recon.core.errors import SettingsError
 from recon.core.text import refuse_other_numbers
 
-_FOLLOWS: Final = {"follows_scene": True}
+_FOLLOWS: Final = "follows_scene"
+_MOST_DOUBLINGS: Final = 2
 
 
-def Length(road_m: float, *, ge: float, le: float) -> Any:
+def Length(road_m: float, *, ge: float, le: float, reach: bool = False) -> Any:
     """Return the field of a length that follows from the size of the scene unless it is set.
 
-    Its default is that of a road; see `Settings.at_scale`.
+    Its default is that of a road; see `Settings.at_scale`. ``reach``: how far a map reaches.
     """
-    return Field(road_m, ge=ge, le=le, json_schema_extra=dict(_FOLLOWS))
+    return Field(road_m, ge=ge, le=le, json_schema_extra={_FOLLOWS: "reach" if reach else "size"})
 
 
 def scaled(road_m: float, scale: float) -> float:
@@ -38,9 +40,19 @@ def scaled(road_m: float, scale: float) -> float:
     return float(f"{scale * road_m:.9g}")
 
 
-def follows_scene(field: FieldInfo) -> bool:
-    """Return whether a field is a `Length`."""
-    return field.json_schema_extra == _FOLLOWS
+def doublings_at(scale: float) -> int:
+    """Return how often voxels are doubled with the depth, so that a map reaches farther.
+
+    Depth says something up to the error that it may have on a road: robots are no smaller in a
+    room. Up to that, but no more than twice, the error and the voxels double in smaller scenes.
+    """
+    return min(max(round(-math.log2(scale)), 0), _MOST_DOUBLINGS)
+
+
+def follows_scene(field: FieldInfo) -> str:
+    """Return how a field follows the scene, ``size`` or ``reach``; "" = it is no `Length`."""
+    extra = field.json_schema_extra
+    return str(extra.get(_FOLLOWS, "")) if isinstance(extra, dict) else ""
 
 
 class Settings(BaseModel):
@@ -89,15 +101,17 @@ class Settings(BaseModel):
     def at_scale(self, scale: float) -> Self:
         """Return settings in which a `Length` that is not set is that of a road times ``scale``.
 
-        All of them are set then, so that another scale changes nothing any more.
+        A reach grows with the root of the error that it may have (`doublings_at`). All of them are
+        set then, so that another scale changes nothing any more.
         """
         found: dict[str, Any] = {}
         for name, field in type(self).model_fields.items():
             value = getattr(self, name)
             if isinstance(value, Settings):
                 found[name] = value.at_scale(scale)
-            elif follows_scene(field) and name not in self.model_fields_set:
-                found[name] = scaled(value, scale)
+            elif (kind := follows_scene(field)) and name not in self.model_fields_set:
+                farther = 2 ** (doublings_at(scale) / 2) if kind == "reach" else 1.0
+                found[name] = scaled(value, scale * farther)
         return self.model_copy(update=found)
 
     def recorded(self, command: str) -> dict[str, Any]:

@@ -26,6 +26,25 @@ def metres(length_m: float, sign: str = "") -> str:
     return f"{length_m:{sign}.{min(max(2 - size, 0), _MOST_DECIMALS)}f} m"
 
 
+def length(length_m: float) -> str:
+    """Return a length in the unit in which it is said, such as ``2 cm``."""
+    for unit, factor, under in (("µm", 1e6, 1e-3), ("mm", 1e3, 0.01), ("cm", 1e2, 1.0)):
+        if length_m < under:
+            return f"{length_m * factor:.2g} {unit}"
+    return f"{float(f'{length_m:.3g}'):,g} m"
+
+
+def round_lengths(least_m: float, most_m: float) -> tuple[float, ...]:
+    """Return 1, 2 and 5 times powers of ten, from the nearest to one length to that to another."""
+    first, last = (math.floor(math.log10(each_m)) for each_m in (least_m, most_m))
+    series = [float(f"{n}e{k}") for k in range(first, last + 2) for n in (1, 2, 5)]
+    low, high = (
+        min(range(len(series)), key=lambda n: abs(math.log(series[n] / each_m)))
+        for each_m in (least_m, most_m)
+    )
+    return tuple(series[low : high + 1])
+
+
 def visible(text: str) -> str:
     """Return a text with control characters, and bytes of odd file names, escaped."""
     return "".join(

@@ -14,13 +14,14 @@ from recon.core.values.arrays import Float64
 from recon.look.look import Look
 from recon.look.rig import LATER, MOST_TIME_OFFSET, MOVES, RefinedRig
 from recon.look.sample import BLANK_DN, MIN_FEATURES, Gaps, Sample, measure_mosaic
-from recon.look.settings import AuditedSettings
+from recon.look.settings import AuditedSettings, AuditSettings
+from recon.sources.settings import SourceSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MatchingSettings, settings_taken
 
 Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
-_FATAL: Final = {"unreadable", "black", "frozen", "swapped", "lag", "nonrigid", "size", "baseline"}
+_FATAL: Final = {"unreadable", "black", "frozen", "swapped", "lag", "nonrigid", "size"}
 _SIDES = ("left", "right")
 _SWAPPED_RATIO: Final = (
     0.8  # fraction of negative disparities from which the cameras count as swapped
@@ -79,8 +80,9 @@ _TEXTS: Final = {
     "{middle:.1f} px of disparity: the baseline of {baseline_m:.3g} m is too short for this scene",
     "size": "the calibration is of another size: principal point of the {side} camera at "
     "({x:.0f}, {y:.0f}) of {width}x{height} pixels; scale it, or use images of the calibrated size",
-    "baseline": "the baseline is implausible: {baseline_m:.4g} m{moving}; check the unit of the "
-    "calibration (--set source.metres_per_unit=0.001 for an OpenCV file in mm)",
+    "baseline": "the baseline is unusual: {baseline_m:.4g} m{moving}; if it is right, --set "
+    "audit.baseline_m=[{low:g},{high:g}] says so, else check the unit of the calibration (--set "
+    "source.metres_per_unit=0.001 for an OpenCV file in mm)",
 }
 
 
@@ -109,8 +111,11 @@ def find_faults(look: Look, config: AuditedSettings) -> list[Finding]:
         *_of_geometry(look),
         *_of_rig(look.rig, look.geometry.disparity_px),
         *_of_range(look.geometry.disparity_px, config.matching, camera),
-        *_of_calibration(sample, rig, camera, config.audit.baseline_m),
+        *_of_calibration(rig),
     ]
+    # Who set the unit knows how large the rig is.
+    if getattr(config, "source", SourceSettings()).metres_per_unit is None:
+        found += _of_baseline(sample, camera.baseline_m, config.audit)
     findings = []
     for key, own in found:
         code = key.split()[0]  # what follows tells texts of one code apart
@@ -228,19 +233,21 @@ def _of_range(disparity_px: Float64, matching: MatchingSettings, camera: Rectifi
         yield "far", {"depth": metres(scale / middle), "middle": middle, **baseline}
 
 
-def _of_calibration(
-    sample: Sample, rig: Rig, camera: RectifiedCamera, baseline_m: tuple[float, float]
-) -> Found:
+def _of_calibration(rig: Rig) -> Found:
     for side, centre, size in _centres(rig):
         if np.abs(np.array(centre) / size - 0.5).max() > LARGEST_CENTRE_OFFSET:
             own = dict(zip(("x", "y", "width", "height"), (*centre, *size), strict=True))
             yield "size", {"side": side, **own}
             break
-    shortest, longest = baseline_m
-    speed = sample.speed_m_per_s
-    if not shortest <= camera.baseline_m <= longest or speed > _MAX_SPEED_M_PER_S:
-        moving = f", with which the rig moves at {speed:.0f} m/s" if speed > 0 else ""
-        yield "baseline", {"baseline_m": camera.baseline_m, "moving": moving}
+
+
+def _of_baseline(sample: Sample, baseline_m: float, settings: AuditSettings) -> Found:
+    (shortest, longest), speed = settings.baseline_m, sample.speed_m_per_s
+    usual = settings.baseline_m == AuditSettings().baseline_m
+    if not shortest <= baseline_m <= longest or (usual and speed > _MAX_SPEED_M_PER_S):
+        moving = f", with which the rig moves at {metres(speed)}/s" if speed > 0 else ""
+        ends = {"low": float(f"{baseline_m / 2:.1g}"), "high": float(f"{2 * baseline_m:.1g}")}
+        yield "baseline", {"baseline_m": baseline_m, "moving": moving, **ends}
 
 
 def _centres(rig: Rig) -> list[tuple[str, tuple[float, float], tuple[int, int]]]:

@@ -20,7 +20,7 @@ from recon.core.geometry.se3 import invert
 from recon.core.kernels import voxels
 from recon.core.settings import Length, Settings
 from recon.core.values import Frame, OccupancyVoxels, PointCloud, RayCloud, RayGrain
-from recon.core.values.arrays import Float32, Float64
+from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.grid import log_odds
 from recon.map.fusion import ALL, FusedPart, FusionSettings, columns_in, sums_in, sums_of
 from recon.map.kernels import clamped, raycast
@@ -46,8 +46,8 @@ class CloudBuilder:
         """Return the number of voxels."""
         return int(self._sums.used[0])
 
-    def integrate(self, cloud: PointCloud) -> None:
-        """Add what one frame saw, in world axes.
+    def integrate(self, cloud: PointCloud, doublings: UInt8 | None = None) -> None:
+        """Add what one frame saw, in world axes; ``doublings`` are those of `voxel_doublings`.
 
         ``confidence`` None = 1, ``sigma_m`` None = all equally precise. What one of the clouds does
         not have, the map does not have.
@@ -64,7 +64,9 @@ class CloudBuilder:
             known = tuple(name for name in self._known if name in cloud.arrays)
             self._sums = self._sums._replace(sums=sums_of(self._sums.sums, self._known, known))
             self._known = known
-        points = voxels.VoxelPoints(cloud.xyz, self._weights(cloud), self._values(cloud))
+        doublings = np.zeros(0, np.uint8) if doublings is None else doublings
+        weights = self._weights(cloud, doublings)
+        points = voxels.VoxelPoints(cloud.xyz, weights, self._values(cloud), doublings)
         self._sums = voxels.add_points(self._sums, points, self._settings.voxel_m, self._frames)
         self._frames += 1
 
@@ -91,7 +93,7 @@ class CloudBuilder:
         """Bytes of the voxels seen so far; the same after `resume` as before."""
         return len(self) * sum(array[:1].nbytes for array in self._sums[1:-1])
 
-    def _weights(self, cloud: PointCloud) -> Float32:
+    def _weights(self, cloud: PointCloud, doublings: UInt8) -> Float32:
         """Return the weight of each point; 0 = not used. float32 (N,)."""
         confidence = np.float32(1) if cloud.confidence is None else cloud.confidence
         if cloud.sigma_m is None:
@@ -99,7 +101,8 @@ class CloudBuilder:
         voxel_m = self._settings.voxel_m
         bounded = np.maximum(cloud.sigma_m, np.float32(_MIN_SIGMA * voxel_m))
         weights = confidence / bounded**2
-        return np.where(cloud.sigma_m <= _MAX_SIGMA * voxel_m, weights, 0).astype(np.float32)
+        most_m = _MAX_SIGMA * voxel_m * (2.0**doublings if len(doublings) else 1.0)
+        return np.where(cloud.sigma_m <= most_m, weights, 0).astype(np.float32)
 
     def _values(self, cloud: PointCloud) -> Float32:
         """Return what is averaged of each point, float32 (N, C); 0 = unknown."""
@@ -128,7 +131,7 @@ class OccupancySettings(Settings):
 
     resolution_m: float = Length(0.2, ge=1e-06, le=1000.0)
     """Edge of a voxel, and of a cell of the grid. Half of it takes about six times the memory."""
-    max_range_m: float = Length(25.0, ge=1e-06, le=100000.0)
+    max_range_m: float = Length(25.0, ge=1e-06, le=100000.0, reach=True)
     """Points farther away hit nothing, and so far from the path the ground is followed and the grid
     reaches. Less for short baselines, more for long ones."""
     keep_rays: bool = True

@@ -107,7 +107,8 @@ class Cutter:
         cells = round(math.log2(config.submaps.tile_m / resolution_m))
         self.edge_cells = 1 << max(BLOCK_BITS, cells - halvings)
         self.edge_m = self.edge_cells * resolution_m
-        margin_m = max(config.scale * _FILTER_MARGIN_M, config.map_filters.radius_m or 0.0)
+        margin_m = (config.map_filters.radius_m or 0.0) * 2 ** (config.fusion.doublings or 0)
+        margin_m = max(config.scale * _FILTER_MARGIN_M, margin_m)
         # A voxel more, since a point may lie anywhere in its voxel; and whether a point moved
         # depends on the points in the voxels that touch those through which it may have grown, at
         # the sides and then twice below.

@@ -16,7 +16,7 @@ from recon.core.geometry.se3 import apply, rotate
 from recon.core.kernels import voxels
 from recon.core.settings import Length, Settings
 from recon.core.values import ATTRIBUTES, Attribute, PointCloud, RectifiedCamera
-from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, array_in
+from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64, UInt8, array_in
 
 _NOMINAL_ERROR_PX: Final = 0.3  # error of a good match, by which the range of fusion is found
 
@@ -31,21 +31,47 @@ class FusionSettings(Settings):
     precise. Lower it for sparse drives and small voxels (2 for half the usual edge), raise it where
     noise is left."""
     max_depth_error_m: float | None = Length(0.25, ge=1e-09, le=1000.0)
-    """Points are fused up to the depth at which a matching error of 0.3 px makes this error; none =
-    all. Raise it to map farther and less precisely."""
+    """Points are fused up to the depth at which a matching error of 0.3 px makes this error, or to
+    that of `doublings`; none = all. Raise it to map farther and less precisely."""
+    doublings: int | None = Field(None, ge=0, le=8)
+    """Beyond that depth, points go into voxels twice as large where they err twice as much, and so
+    on, so often; 0 = none beyond. none = as the scene is: 0 on a road, 1 in one half as large, 2 in
+    smaller ones."""
     remove_moving: bool = True
     """Leave points of things that moved out of the cloud and the mesh: what was there as a whole at
     one time and gone at another, by the rays of single frames (occupancy.keep_rays). They are
     written to map/removed.ply. What left before a plain wall, which no ray reaches, is taken out of
     occupancy and grid, too."""
 
+    @property
+    def largest_voxel_m(self) -> float:
+        """Edge of a voxel where depth is least certain."""
+        return self.voxel_m * 2.0 ** (self.doublings or 0)
+
+
+def nominal_error_m(depth_m: float, camera: RectifiedCamera) -> float:
+    """Return the error that 0.3 px make at a depth: ``Z²·error_px / (f·b)``."""
+    return depth_m**2 * _NOMINAL_ERROR_PX / (camera.focal_px * camera.baseline_m)
+
 
 def fusion_range_m(camera: RectifiedCamera, settings: FusionSettings) -> float:
-    """Return the depth at which 0.3 px are ``max_depth_error_m``: ``Z²·error_px / (f·b)``."""
+    """Return the depth up to which points are fused."""
     if settings.max_depth_error_m is None:
         return math.inf
-    fb = camera.focal_px * camera.baseline_m
-    return math.sqrt(settings.max_depth_error_m * fb / _NOMINAL_ERROR_PX)
+    most_m = settings.max_depth_error_m * 2.0 ** (settings.doublings or 0)
+    return math.sqrt(most_m / nominal_error_m(1.0, camera))
+
+
+def voxel_doublings(
+    depth_m: NDArray[np.floating], camera: RectifiedCamera, settings: FusionSettings
+) -> UInt8:
+    """Return uint8 (N,), how often voxels are doubled for points at depths (N,)."""
+    if not settings.doublings or settings.max_depth_error_m is None:
+        return np.zeros(len(depth_m), np.uint8)
+    times = (
+        nominal_error_m(1.0, camera) / settings.max_depth_error_m * depth_m.astype(np.float64) ** 2
+    )
+    return np.ceil(np.log2(np.clip(times, 1.0, 2.0**settings.doublings))).astype(np.uint8)
 
 
 KNOWABLE: Final = ("rgb", "normals", "sigma_m", "confidence")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from recon.core.errors import MemoryLimitError
 from recon.core.machine import peak_memory_mb, return_free_memory
-from recon.core.settings import Length, Settings
+from recon.core.settings import Length, Settings, doublings_at
+from recon.core.values import PointCloud
 from recon.map.builders import OccupancySettings, SubmapSettings
 from recon.map.fusion import FusionSettings
 from recon.map.ground.axes import AxesSettings
@@ -126,6 +129,17 @@ class DriveSettings(StereoSettings):
         """Size of the scene against a road."""
         return self.scene.scale or 1.0
 
+    def island_radii_m(self, cloud: PointCloud) -> float | NDArray[Any] | None:
+        """Return the radius in which points need neighbours; uncertain ones, in coarser voxels.
+
+        None = in none; (N,) = of each point.
+        """
+        radius_m, doublings = self.map_filters.radius_m, self.fusion.doublings
+        if radius_m is None or not doublings or cloud.sigma_m is None or cloud.count is None:
+            return radius_m
+        frame_sigma = cloud.sigma_m * np.sqrt(cloud.count) / self.fusion.voxel_m
+        return np.asarray(radius_m * 2.0 ** np.clip(np.ceil(np.log2(frame_sigma)), 0, doublings))
+
     def with_odometry(self, odometry: str | Odometry) -> Self:
         """Return the settings with another odometry, by name or as an object.
 
@@ -140,6 +154,10 @@ class DriveSettings(StereoSettings):
         scale = self.scene.scale or scale
         scene = SceneSettings(scale=scale)
         fitted = super().at_scale(scale).model_copy(update={"scene": scene})
+        if fitted.fusion.doublings is None:
+            update = {"doublings": doublings_at(scale)}
+            fusion = fitted.fusion.model_copy(update=update)
+            fitted = fitted.model_copy(update={"fusion": fusion})
         return self.parse(dict(fitted))  # again: what is set may not go with what follows
 
     @model_validator(mode="after")

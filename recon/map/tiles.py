@@ -248,7 +248,8 @@ class Tiles:
                 moved = find_moved(points, sigma_m, counted, voxels, evidence, self.observations)
             kept.append(fused.select(~moved))
             removed.append(fused.select(moved))
-        cloud = drop_islands(self._exported(kept), self.config.map_filters.radius_m)
+        cloud = self._exported(kept)
+        cloud = drop_islands(cloud, self.config.island_radii_m(cloud))
         return self._placed(key, cloud), self._placed(key, self._exported(removed))
 
     def _exported(self, parts: Iterable[FusedPart]) -> PointCloud:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.text import counted
+from recon.core.text import counted, length
 from recon.core.values import RectifiedPair
 from recon.look.sample import PairMeasures
 from recon.report import style
@@ -17,7 +17,7 @@ from recon.report.page import write_page
 from recon.report.pair_page import disparity_figure, is_wide, pair_figure
 from recon.report.rig_part import rig_section
 from recon.report.sections import Image, Page, Section, Table, known
-from recon.rig.audit import Audit
+from recon.rig.audit import Audit, middle_depth
 from recon.run.directory import RunDirectory
 from recon.sources.source import StereoSource
 from recon.stereo.match.protocol import Matcher
@@ -40,11 +40,12 @@ def write_audit_page(
         *(_pair_section(look, pair, matcher) for look, pair in looked_at),
     ]
     depths_m, rig = found.get("depth_error_m"), found.get("rig_by_motion")
+    at, off_m = middle_depth(depths_m) or ("", 0.0)
     off_percent = rig["depth_percent"]["10"]["mean"] if rig else None
     figures = [
         ("Epipolar error (RMS)", known("{:.2f} px", found["epipolar_error_rms_px"])),
         ("Baseline", known("{:.4g} m", found["baseline_m"])),
-        ("Depth error at 10 m, by noise", f"{100 * depths_m['10']:.2g} cm" if depths_m else ""),
+        (f"Depth error at {at} m, by noise", "" if depths_m is None else length(off_m)),
         ("Depth at 10 m, by the rig", known("{:+.1f} %", off_percent)),
     ]
     subtitle, texts = f"{source.description}, {lines['frames']}", [x.text for x in audit.findings]
@@ -130,7 +131,7 @@ def audit_lines(summary: Mapping[str, Any]) -> dict[str, str]:
             "median {disparity_5_50_95_px[1]:.1f} px"
         ),
         "rig": _rig(summary),
-        "depth error": ", ".join(f"{_length(off)} at {at} m" for at, off in depths_m.items())
+        "depth error": ", ".join(f"{length(off)} at {at} m" for at, off in depths_m.items())
         or "not known",
     }
     if (by_motion := summary.get("rig_by_motion")) is not None:
@@ -195,11 +196,4 @@ def _rig(summary: Mapping[str, Any]) -> str:
     speed = summary["speed_m_per_s"]
     moving = "" if speed is None else f", moving at {speed:.1f} m/s"
     view = f"f {summary['focal_px']:.0f} px ({summary['field_of_view_deg']:.0f} deg wide)"
-    return f"baseline {_length(summary['baseline_m'])}, {view}{moving}"
-
-
-def _length(metres: float) -> str:
-    for unit, factor, under in (("mm", 1000.0, 0.01), ("cm", 100.0, 1.0)):
-        if metres < under:
-            return f"{metres * factor:.2g} {unit}"
-    return f"{metres:.3g} m"
+    return f"baseline {length(summary['baseline_m'])}, {view}{moving}"

@@ -12,7 +12,7 @@ import numpy as np
 from recon.core.errors import CalibrationError, MatchingError
 from recon.core.progress import stage
 from recon.core.summary import Figures, Rows, RunSummary, hidden, inline, optional, shown_path
-from recon.core.text import counted, metres
+from recon.core.text import counted, length, metres, round_lengths
 from recon.core.values import Disparity, Reason, RectifiedCamera, Rig
 from recon.core.values.arrays import Float64
 from recon.core.values.camera import depth_sigma
@@ -29,7 +29,6 @@ from recon.stereo.observe import Support
 from recon.stereo.rectify.epipolar import EpipolarAlignment, correct_rig
 from recon.stereo.rectify.rectifier import turns_of
 
-_RANGES_M: Final = (2.0, 5.0, 10.0, 20.0, 50.0)  # distances for which the depth error is predicted
 # Findings of a pair that images alone support, and those that need a calibration. The inspection of
 # the frame reports others.
 _BY_IMAGES: Final = frozenset({"black", "mosaic", "gain", "blur", "features"})
@@ -41,7 +40,7 @@ _FEW_MEASURED_RATIO: Final = 0.25
 _NOT_OF_THE_RIG: Final = frozenset(
     {"lag", "nonrigid", "stabilised", "swapped", "size", "frozen", "unreadable"}
 )
-_SHOWN_AT: Final = "10"  # distance of the depth error that the terminal says
+_LEAST_DISPARITY_PX: Final = 1.0  # farther than that, depths of a table say nothing
 _LEAST_SIGMA_PX: Final = 0.05  # no matcher is more accurate on real images
 
 
@@ -130,17 +129,13 @@ class AuditSummary(RunSummary):
         found = self.figures
         frames = f"{counted(found.frames, 'frame')}, {found.frames_read} examined"
         repeated = f", {found.repeated_frames} repeated" if found.repeated_frames else ""
-        rms_px, depths_m = found.epipolar_error_rms_px, found.depth_error_m or {}
-        off_m = depths_m.get(_SHOWN_AT)
+        rms_px, at = found.epipolar_error_rms_px, middle_depth(found.depth_error_m)
+        depth = "" if at is None else f"± {length(at[1])} at {at[0]} m (standard deviation)"
         return [
             (f"{found.source} is {self.verdict}",),
             ("frames", frames + repeated),
             *([] if rms_px is None else [("epipolar", f"error of {rms_px:.2f} px (RMS)")]),
-            *(
-                []
-                if off_m is None
-                else [("depth", f"± {off_m:.2g} m at {_SHOWN_AT} m (standard deviation)")]
-            ),
+            *([("depth", depth)] if depth else []),
             ("rig", f"baseline {metres(found.baseline_m)}, focal length {found.focal_px:.0f} px"),
             *([] if self.repaired is None else [("repaired", ", ".join(self.repaired.files))]),
             *self.folder_row(),
@@ -303,12 +298,21 @@ def _with_alignment(
     if not len(disparity_px):
         return found
     sigma_px = np.float32(max(alignment.residual_px, _LEAST_SIGMA_PX))
-    errors = depth_sigma(np.array(_RANGES_M, np.float32), sigma_px, camera)
-    return replace(
-        found,
-        disparity_5_50_95_px=np.quantile(disparity_px, [0.05, 0.5, 0.95]).tolist(),
-        depth_error_m={f"{r:g}": float(e) for r, e in zip(_RANGES_M, errors, strict=True)},
-    )
+    spread_px = np.quantile(disparity_px, [0.05, 0.5, 0.95])
+    found = replace(found, disparity_5_50_95_px=spread_px.tolist())
+    if not spread_px[1] > 0.0:
+        return found
+    far_px, near_px = np.maximum(spread_px[[0, 2]], _LEAST_DISPARITY_PX)
+    fb = camera.focal_px * camera.baseline_m
+    depths_m = round_lengths(fb / near_px, fb / far_px)
+    errors = depth_sigma(np.array(depths_m, np.float32), sigma_px, camera)
+    by_depth = {f"{z:g}": float(e) for z, e in zip(depths_m, errors, strict=True)}
+    return replace(found, depth_error_m=by_depth)
+
+
+def middle_depth(error_m: Mapping[str, float] | None) -> tuple[str, float] | None:
+    """Return the depth in the middle of those that a drive shows, and its error."""
+    return [*error_m.items()][(len(error_m) - 1) // 2] if error_m else None
 
 
 def check_related(look: Look, config: StereoSettings) -> None:

@@ -115,7 +115,11 @@ class RectifyResult:
 
 
 def plan_by_calibration(
-    path: Path, images: ImagePairs, settings: RectificationSettings, *, metres_per_unit: float
+    path: Path,
+    images: ImagePairs,
+    settings: RectificationSettings,
+    *,
+    metres_per_unit: float | None,
 ) -> RectifyPlan:
     """Return the rectification by a calibration file; depth is metric."""
     files = images.pairs[0]

@@ -39,8 +39,9 @@ class SourceSettings(Settings):
     max_megapixels: float = Field(MAX_MEGAPIXELS, ge=1e-4, le=10_000.0)
     """Largest image that is read, in 10⁶ pixels; larger ones are refused before they are
     decoded."""
-    metres_per_unit: float = Field(1.0, ge=1e-6, le=1e6)
-    """Unit of the translation in an OpenCV calibration file: 0.001 for mm."""
+    metres_per_unit: float | None = Field(None, ge=1e-6, le=1e6)
+    """Unit of the translation in an OpenCV calibration file: 0.001 for mm, 1 for metres; none =
+    metres, and a baseline that is unusual is doubted."""
     pair_by: Literal["auto", "stamp", "name", "index"] = "auto"
     """How images of plain folders are paired. auto = by timestamps if the names have them, else by
     names if most have a partner, else by order."""

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, model_validator
 from typing_extensions import Self
 
@@ -172,7 +173,7 @@ class CloudSettings(Settings):
     matcher found."""
     min_range_m: float = Length(0.1, ge=0, le=1000000.0)
     """Nearest depth kept. Set it to hide a bonnet or gripper."""
-    max_range_m: float | None = Length(30.0, ge=1e-06, le=1000000.0)
+    max_range_m: float | None = Length(30.0, ge=1e-06, le=1000000.0, reach=True)
     """Farthest depth kept; none = no limit. The error of a depth grows with its square."""
     max_relative_sigma: float | None = Field(0.1, ge=1e-06, le=1000000.0)
     """Largest standard deviation of a depth kept, as a fraction of it; none = no limit. Smaller for
@@ -302,7 +303,7 @@ def filter_cloud(cloud: PointCloud, settings: FilterSettings) -> PointCloud:
     return cloud
 
 
-def drop_islands(cloud: PointCloud, radius_m: float | None) -> PointCloud:
+def drop_islands(cloud: PointCloud, radius_m: float | NDArray[Any] | None) -> PointCloud:
     """Drop points with too few others within a radius; None = keep all."""
     if radius_m is None:
         return cloud

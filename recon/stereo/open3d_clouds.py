@@ -48,7 +48,7 @@ def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bo
     return mask
 
 
-def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float) -> Bool:
+def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float | NDArray[Any]) -> Bool:
     """Return bool (N,), points that have at least ``neighbours`` others within ``radius_m``."""
     if len(xyz) <= neighbours:
         return np.zeros(len(xyz), dtype=bool)

@@ -106,7 +106,8 @@ MAP = MapSummary(
     odometry="visual", source="06", frames=1101, fps=12.34, frames_joined=1100, segments=(),
     path_length_m=1234.5, expected_drift_percent=0.25, expected_drift_rig_percent=0.1,
     frames_not_trusted=12, focal_px=700.0, field_of_view_deg=80.0, T_map_world=np.eye(4), scale=1.0,
-    voxel_m=0.1, typical_depth_m=12.5, made=MADE, rig=RigFigures(refined=True), trajectory=PATH,
+    voxel_m=0.1, largest_voxel_m=0.1, reach_m=18.0, reach_error_m=0.25,
+    typical_depth_m=12.5, made=MADE, rig=RigFigures(refined=True), trajectory=PATH,
     map=SURFACE, read=SourceFigures(), **COST,
 )  # fmt: skip
 LIVE = SourceFigures(

@@ -169,7 +169,7 @@ def test_an_empty_map_of_frames_that_share_no_place_is_told_in_one_sentence(seen
 
 def test_a_baseline_in_another_unit_is_warned_of_and_throws_nothing_away(seen, tmp_path):
     run = map_drive(seen[:4], tmp_path, baseline=1000, audit=True)
-    assert "baseline is implausible: 540 m" in " ".join(run.warnings)
+    assert "baseline is unusual: 540 m" in " ".join(run.warnings)
     assert run.summary.to_json()["scale"] == 1000.0
     assert len(run.cloud)
 

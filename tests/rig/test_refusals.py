@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from recon.commands.config import load_config
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MatchingError, SourceError
@@ -155,3 +156,15 @@ def test_a_drive_of_two_drives_is_refused_and_one_in_the_dark_is_not_for_that(st
     black = faults.changed(street, lambda left, right: (0 * left, 0 * right))
     check_related(look_at(black, CONFIG), CONFIG)
     check_related(look_at(street, CONFIG), CONFIG)
+
+
+def test_a_small_or_large_rig_is_no_fault_and_none_once_its_unit_is_set(street):
+    for baseline_m, widened in ((0.004, "[0.002,0.008]"), (2000.0, "[1000,4000]")):
+        camera = replace(faults.rectified(street), baseline_m=baseline_m)
+        look = look_at(replace(street, camera=camera), CONFIG)
+        found = {one.code: one for one in find_faults(look, CONFIG)}
+        assert not found["baseline"].fatal
+        assert f"--set audit.baseline_m={widened} says so" in found["baseline"].text
+        for known in (f"audit.baseline_m={widened}", "source.metres_per_unit=0.001"):
+            config = load_config(None, [known])
+            assert "baseline" not in {one.code for one in find_faults(look, config)}

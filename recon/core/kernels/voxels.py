@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.core.kernels.compiled import Bool, Float32, Int32, Int64, kernel
+from recon.core.kernels.compiled import Bool, Float32, Int32, Int64, UInt8, kernel
 
 KEY_BITS: Final = 21
 KEY_LIMIT: Final = 1 << (KEY_BITS - 1)  # cell indices are at least minus this, and less
@@ -52,6 +52,9 @@ class VoxelPoints(NamedTuple):
     xyz: NDArray[np.floating]  # (N, 3), finite, with cells inside ``KEY_LIMIT``
     weights: Float32  # (N,); points with a weight of 0 or less are left out
     values: Float32  # (N, C), numbers to average, such as colours
+    # (N,), how often the edge of the voxel of each is doubled; empty = never. The sums of such a
+    # voxel are those of the cell in its middle, in its upper half.
+    doublings: UInt8 = np.zeros(0, np.uint8)
 
 
 def make_table(rows: int) -> Int64:
@@ -196,7 +199,7 @@ def add_points(voxels: VoxelSums, points: VoxelPoints, edge: float, frame: int) 
 def _add_points(voxels: Arrays, points: Arrays, edge: float, frame: int, start: int) -> int:
     """Add points from ``start`` on; return the first that finds no memory left."""
     table, keys, sums, information, best, frames, last, used = voxels
-    xyz, weights, values = points
+    xyz, weights, values, doublings = points
     columns, rows = values.shape[1], used[0]
     for n in range(start, len(xyz)):
         w = weights[n]
@@ -207,6 +210,9 @@ def _add_points(voxels: Arrays, points: Arrays, edge: float, frame: int, start: 
             return n
         x, y, z = xyz[n, 0] / edge, xyz[n, 1] / edge, xyz[n, 2] / edge
         i, j, k = math.floor(x), math.floor(y), math.floor(z)
+        if len(doublings) and doublings[n]:
+            by, half = doublings[n], 1 << (doublings[n] - 1)
+            i, j, k = (i >> by << by) + half, (j >> by << by) + half, (k >> by << by) + half
         key = pack_key(i, j, k)
         row = find_or_add(table, key, rows)
         if row == rows:

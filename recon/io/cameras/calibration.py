@@ -142,7 +142,7 @@ def read_calibration(
     width_px: int | None = None,
     height_px: int | None = None,
     *,
-    metres_per_unit: float = 1.0,
+    metres_per_unit: float | None = None,
     cameras: tuple[int, int] | None = None,
 ) -> Rig:
     """Read the calibration of images of one size from a file of any supported format.

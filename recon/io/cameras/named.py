@@ -72,13 +72,14 @@ _MOST_SHOWN: Final = 8  # names of a file in an error
 
 @reader
 def read_named(
-    path: StrPath, size_px: Size | None = None, *, metres_per_unit: float = 1.0
+    path: StrPath, size_px: Size | None = None, *, metres_per_unit: float | None = None
 ) -> Rig | None:
     """Read the rig of a file by the names in it; None = there is no camera.
 
     Files that belong together are read as one: ``intrinsics`` and ``extrinsics``, ``left`` and
     ``right``, the two that a third names. ``size_px`` (width, height) is for files that do not
-    state it; ``metres_per_unit`` other than 1 is the unit of lengths, in place of the program's.
+    state it; ``metres_per_unit`` is the unit of lengths, None = the program's, of a baseline
+    that a rig may have.
     """
     contents = _with_others(Path(path), read_contents(path))
     keys = list(contents) or [""]
@@ -89,8 +90,11 @@ def read_named(
         contents, size_px = _of_resolution(contents, size_px, path)
     if "OAK" in form:
         contents = _of_sockets(contents)
-    unit_m = unit_m if metres_per_unit == 1.0 else metres_per_unit
-    return _Named(contents, form, path, unit_m).rig(size_px)
+    named = _Named(contents, form, path, metres_per_unit or unit_m)
+    rig = named.rig(size_px)
+    if metres_per_unit is None and rig is not None:
+        _check_unit(rig.baseline_m)
+    return rig
 
 
 @reader
@@ -192,9 +196,7 @@ class _Named:
                 self.camera("", None, size_px)
             named = {"P1": projections[0], "P2": projections[1]}
             camera = self.camera("left", named["P1"][:, :3], size_px)
-            rectified = projected_rig(named, camera.width_px, camera.height_px)
-            _check_unit(rectified.baseline_m)
-            return rectified
+            return projected_rig(named, camera.width_px, camera.height_px)
         if left is None or right is None:
             return self._rectified(*2 * (self.camera("", one, size_px),))
         cameras = self.camera("left", left, size_px), self.camera("right", right, size_px)
@@ -372,7 +374,6 @@ class _Named:
             what = "settings of ORB-SLAM for raw images are not complete"
             given = f"if the images are rectified give {in_options(f, baseline_m, cx, cy)}"
             raise FormatError(what, expected="K, D, R and P of LEFT and RIGHT", hint=given)
-        _check_unit(baseline_m)
         size = left.width_px, left.height_px
         return RectifiedCamera.from_matrices(left.matrix, right.matrix, baseline_m, *size)
 
@@ -391,7 +392,8 @@ def _check_unit(baseline_m: float) -> None:
     if baseline_m > _LONGEST_BASELINE_M:
         what = "baseline is implausibly long"
         got, expected = f"{baseline_m:g} m", f"at most {_LONGEST_BASELINE_M:g} m"
-        hint = "in millimetres? --set source.metres_per_unit=0.001, in Python metres_per_unit=0.001"
+        hint = "in millimetres? --set source.metres_per_unit=0.001 (1 if it is right), in Python "
+        hint += "metres_per_unit=0.001"
         raise CalibrationError(what, got=got, expected=expected, hint=hint)
 
 

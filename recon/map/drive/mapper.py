@@ -13,7 +13,7 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import transform_cloud
 from recon.core.text import counted
 from recon.core.values import PointCloud, RayCloud, RectifiedCamera
-from recon.core.values.arrays import Float64, freeze, tree_of
+from recon.core.values.arrays import Float64, UInt8, freeze, tree_of
 from recon.core.work import OneBehind, Stopwatch
 from recon.look.geometry import MOST_EPIPOLAR_ERROR_PX
 from recon.map.builders import (
@@ -25,7 +25,7 @@ from recon.map.builders import (
     ray_grain,
     thin_rays,
 )
-from recon.map.fusion import FusionSettings, fusion_range_m
+from recon.map.fusion import FusionSettings, fusion_range_m, voxel_doublings
 from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
@@ -109,8 +109,9 @@ class Mapper:
         with self._stage("map"):
             rays = thin_rays(cloud, self._config.occupancy) if rays is None else rays
             near = cloud.select(cloud.xyz[:, 2] <= self._fusion_range_m)
+            doublings = voxel_doublings(near.xyz[:, 2], self._camera, self._config.fusion)
             cloud_world = transform_cloud(near, T_world_camera, frame="world")
-            builder.integrate(cloud_world, rays.cloud(), T_world_camera)
+            builder.integrate(cloud_world, rays.cloud(), T_world_camera, doublings)
         with self._stage("store"):
             if self._grain is not None:
                 self.session.add_rays(frame, rays, self._grain)
@@ -215,10 +216,14 @@ class SubmapBuilder:
         return self._frames
 
     def integrate(
-        self, cloud_world: PointCloud, cloud_camera: PointCloud, T_world_camera: Float64
+        self,
+        cloud_world: PointCloud,
+        cloud_camera: PointCloud,
+        T_world_camera: Float64,
+        doublings: UInt8 | None = None,
     ) -> None:
         """Add a frame: ``cloud_world`` is fused, ``cloud_camera`` occupies and frees space."""
-        self._fused.integrate(cloud_world)
+        self._fused.integrate(cloud_world, doublings)
         self._occupancy.integrate(cloud_camera, T_world_camera)
         place = T_world_camera[:3, 3]
         if self._last_m is not None:

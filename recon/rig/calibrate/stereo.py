@@ -18,7 +18,7 @@ import numpy as np
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply, exp_so3, invert, log_so3, make_transform
 from recon.core.progress import tracked
-from recon.core.text import counted
+from recon.core.text import counted, round_lengths
 from recon.core.values import CameraIntrinsics, StereoCalibration
 from recon.core.values.arrays import Float64
 from recon.rig.calibrate.bundle import (
@@ -280,7 +280,7 @@ _PLACES: Final = (0.2, 0.5, 0.8)  # depth errors are those of a 3 by 3 grid in t
 _MIDDLE: Final = 4
 _MATCHED: Final = 0.02  # relative error of matching at the default working distance
 MATCH_SIGMA_PX: Final = 0.25  # assumed matching error, by which depth errors are predicted
-DEPTHS_M: Final = (2.0, 5.0, 10.0, 20.0)  # depths at which the error is predicted
+_AROUND: Final = (0.2, 2.0)  # of the working distance: depths at which the error is predicted
 _RESAMPLES: Final = 500
 CONFIDENCE: Final = 0.95  # confidence level of the intervals
 
@@ -336,15 +336,16 @@ def _resample(fit: StereoFit) -> list[StereoCalibration]:
 
 def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
     """Return bootstrap intervals of focal length, baseline, rotation and depth."""
-    rigs = _resample(fit)
+    rigs, working_m = _resample(fit), _working_distance(fit.calibration, settings)
     turns = [rig.T_right_left[:3, :3] @ fit.calibration.T_right_left[:3, :3].T for rig in rigs]
     cosines = np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)
+    depths_m = round_lengths(*(part * working_m for part in _AROUND))
     return Spread(
         focal_px=_interval([rig.left.matrix[0, 0] for rig in rigs]),
         baseline_m=_interval([rig.baseline_m for rig in rigs]),
         rotation_deg=float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2)))),
-        depths=tuple(_depth_error(fit, rigs, depth) for depth in DEPTHS_M),
-        working=_depth_error(fit, rigs, _working_distance(fit.calibration, settings)),
+        depths=tuple(_depth_error(fit, rigs, depth) for depth in depths_m),
+        working=_depth_error(fit, rigs, working_m),
     )
 
 

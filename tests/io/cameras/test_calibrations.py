@@ -328,6 +328,9 @@ def test_opencv_files_in_millimetres_and_with_extrinsics_beside_them_are_read(tm
     said = r"got 120\.\d+ m.*--set source.metres_per_unit=0.001"
     with pytest.raises(CalibrationError, match=rf"stereo\.yml: baseline is impl.*{said}"):
         read_calibration(path, 640, 480)
+    large = read_calibration(path, 640, 480, metres_per_unit=1.0)
+    assert isinstance(large, StereoCalibration)
+    np.testing.assert_allclose(large.T_right_left[:3, 3], T_MM[:, 0])  # who sets it knows
     path = write_nodes(tmp_path / "intrinsics.yml", **NODES)
     beside = tmp_path / "extrinsics.yml"
     write_nodes(beside, **POSE, P1=np.eye(3, 4), P2=np.eye(3, 4))
