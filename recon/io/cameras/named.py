@@ -203,15 +203,11 @@ class _Named:
         T = self._pose()
         if T is not None:
             T[:3, 3] *= self._unit_m
-            rig = StereoCalibration(*cameras, T)
-        elif turns[0] is None or turns[1] is None or projections is None:
+            return StereoCalibration(*cameras, T)
+        if turns[0] is None or turns[1] is None or projections is None:
             return self._rectified(*cameras)
-        else:
-            left, right = turns[0].reshape(3, 3), turns[1].reshape(3, 3)
-            both = (cameras[0], left), (cameras[1], right)
-            rig = rig_of_camera_infos(*both, projections, self._where)
-        _check_unit(rig.baseline_m)
-        return rig
+        both = (cameras[0], turns[0].reshape(3, 3)), (cameras[1], turns[1].reshape(3, 3))
+        return rig_of_camera_infos(*both, projections, self._where)
 
     def matrix(self, side: Side) -> Float64 | None:
         """Return the camera matrix (3, 3) of a side, pixel centres at integers; None = none."""
