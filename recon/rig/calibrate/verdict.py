@@ -55,7 +55,7 @@ _TEXTS: Final = {
     "together": "both cameras together fit worse than alone: not synchronised, or moved?",
     "rows": "the epipolar error is {epipolar_95_px:.2f} px after rectification (95 % of the "
     "corners are better): matching fails there; is the board flat, does --model suit?",
-    "baseline": "baseline is {baseline_m:.3g} m: are the squares really {square_mm:g} mm?",
+    "baseline": "baseline is {baseline_m:.3g} m: are the {said} really {given_mm:g} mm?",
     "square": "size of a square not given: every length is in squares; add it, as in :25mm",
     "order": "names do not say which images belong together: paired by their order",
     "unpaired": "images without a partner, left out: {count} ({names})",
@@ -141,7 +141,8 @@ def _doubts(board: CalibrationBoard, found: CalibrationFigures) -> Found:
         yield "rows", {}
     shortest, longest = _USUAL_BASELINE_M
     if board.metric and not shortest <= found.baseline_m <= longest:
-        yield "baseline", {"square_mm": 1e3 * board.square_m}
+        said, given_m = board.measured
+        yield "baseline", {"said": said, "given_mm": 1e3 * given_m}
 
 
 def _left_out(board: CalibrationBoard, images: ImagePairs, found: CalibrationFigures) -> Found:
