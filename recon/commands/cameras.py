@@ -89,7 +89,8 @@ def run_calibrate(
         with run.stage("find"):
             seen = find_views(images, board, run.threads)
         with run.stage("solve"), serial_algebra():
-            fit = calibrate_stereo(seen.views, seen.size_px, config.calibration)
+            circle_m = board.marker_m if board.kind in ("circles", "acircles") else 0.0
+            fit = calibrate_stereo(seen.views, seen.size_px, config.calibration, circle_m)
         with run.stage("bootstrap"), serial_algebra():
             spread = measure_spread(fit, config.calibration)
         result = describe_calibration(seen, fit, spread, config, images)

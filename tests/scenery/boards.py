@@ -17,7 +17,9 @@ from recon.stereo.rectify.lens import project_raw, rays_of
 
 Lens = Literal["radtan", "rational", "fisheye"]
 
-_TEXELS: Final = 48  # per square; corners lie on the borders between texels
+# Per square or step; corners lie on the borders between texels, and the cells of tags with gaps of
+# 0.3 do. Borders of circles are staircases.
+_TEXELS: Final = {"chess": 48, "charuco": 48, "aprilgrid": 52, "circles": 192, "acircles": 192}
 _WHITE, _DARK, _WALL = 225.0, 28.0, 120.0
 _MARGIN_PX: Final = 6.0
 _OFFSETS: Final = (np.arange(4) + 0.5) / 4 - 0.5  # of rays in a pixel
@@ -80,7 +82,7 @@ class BoardRenderer:
         self._by_v = np.asarray(np.gradient(self._rays, axis=0))
         self._by_u = np.asarray(np.gradient(self._rays, axis=1))
         self._texture, self._low = _texture(board)
-        self._texels = _TEXELS * (4 if board.kind.endswith("circles") else 1)
+        self._texels = _TEXELS[board.kind]
 
     def render(self, T_camera_board: Float64, sigma_grey: float = 0.0, seed: int = 0) -> UInt8:
         """uint8 (H, W), the board at a pose in front of a grey wall, with noise of that sigma."""
@@ -139,7 +141,7 @@ def _texture(board: CalibrationBoard) -> tuple[Float64, Float64]:
     outlines = dark_polygons(board) / board.square_m
     low = np.floor(outlines.min(axis=(0, 1))) - 1.0
     columns, rows = np.ceil(outlines.max(axis=(0, 1)) - low).astype(int) + 1
-    texels = _TEXELS * (1 if outlines.shape[1] == 4 else 4)  # circles: their border is a staircase
+    texels = _TEXELS[board.kind]
     texture = np.full((rows * texels, columns * texels), _WHITE)
     for outline in (outlines - low) * texels:
         (x0, y0), (x1, y1) = (

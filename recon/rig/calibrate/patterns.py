@@ -33,6 +33,7 @@ _PREFIX: Final = "DICT_"
 _TAG_BITS: Final = 6  # along a side of tag36h11
 # Bits of another tag of the family differ in 11 of 36: they correlate by at most 1 - 2 * 11 / 36.
 _SAME_TAG: Final = 0.7
+_REACHES: Final = (1.0, 0.7, 1.5)  # windows of the first search for a tag, relative to the usual
 _ROUND: Final = 2.0 * math.pi * np.arange(64) / 64
 
 
@@ -53,12 +54,15 @@ def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
 
 def _scales(corners_m: Float64, pixels: Float64) -> Float64:
     """Return float64 (N,), pixels per metre around each corner, in the direction with the least."""
-    apart_m, apart_px = (
-        np.linalg.norm(each[:, None] - each[None], axis=2) for each in (corners_m, pixels)
-    )
-    near = np.argsort(apart_m, axis=1, kind="stable")[:, 1:5]
-    ratios = np.take_along_axis(apart_px, near, 1) / np.take_along_axis(apart_m, near, 1)
-    return np.asarray(ratios.min(axis=1))
+    apart_m, apart_px = (each[None] - each[:, None] for each in (corners_m[:, :2], pixels))
+    square = (apart_m**2).sum(axis=2)
+    near = np.argsort(square, axis=1, kind="stable")[:, 1:7]
+    by_m, by_px = (np.take_along_axis(each, near[..., None], 1) for each in (apart_m, apart_px))
+    by_m = by_m / np.take_along_axis(square, near, 1)[..., None]
+    # The affine map that fits the way to the nearest corners, each weighted by its distance.
+    A = np.linalg.pinv(by_m.transpose(0, 2, 1) @ np.take_along_axis(apart_m, near[..., None], 1))
+    singular = np.linalg.svd(A @ by_m.transpose(0, 2, 1) @ by_px, compute_uv=False)
+    return np.where(singular[:, 1] > 1e-3 * singular[:, 0], singular[:, 1], singular[:, 0])
 
 
 def refine_corners(grey: UInt8, pixels: Float64, reach_px: Float64) -> Float64:
@@ -117,19 +121,22 @@ def _find_tags(grey: UInt8, board: CalibrationBoard) -> Found | None:
     # The squares between tags touch their corners, which hides most tags from OpenCV. Where one is
     # known, its neighbours are looked for where they must be.
     found: dict[int, tuple[float, Float64]] = {}
-    corners, ids, _ = _tag_detector(board.legacy).detectMarkers(grey)
-    for tag, quad in zip([] if ids is None else ids.ravel().tolist(), corners, strict=True):
-        _keep_tag(found, grey, board, tag, quad.reshape(4, 2)[[1, 0, 2, 3]].astype(np.float64))
+    for scale in (1, 2):  # enlarged, more are separate
+        large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+        corners, ids, _ = _tag_detector(_border(board)).detectMarkers(large)
+        for tag, quad in zip([] if ids is None else ids.ravel().tolist(), corners, strict=True):
+            pixels = (quad.reshape(4, 2)[[1, 0, 2, 3]].astype(np.float64) + 0.5) / scale - 0.5
+            _keep_tag(found, grey, board, tag, pixels)
+        if found:
+            break
     fresh = set(found)
     while fresh:
         known, fresh = {tag: quad for tag, (_, quad) in found.items()}, set()
         for tag in set(range(board.columns * board.rows)) - set(known):
             near = [n for n in _around(tag, board) if n in known]
-            if near:
-                flat = np.concatenate([_tag_m(n, board) for n in near])
-                H, _ = cv2.findHomography(flat, np.concatenate([known[n] for n in near]))
-                if H is not None:
-                    guess = cv2.perspectiveTransform(_tag_m(tag, board)[None], H)[0]
+            for reach in _REACHES if near else ():
+                if tag not in fresh:
+                    guess = _guess_tag(grey, board, tag, {n: known[n] for n in near}, reach)
                     fresh |= _keep_tag(found, grey, board, tag, guess)
     alone = {tag for tag in found if not any(n in found for n in _around(tag, board))}
     tags = sorted(found if len(alone) == len(found) else set(found) - alone)
@@ -139,35 +146,63 @@ def _find_tags(grey: UInt8, board: CalibrationBoard) -> Found | None:
     return numbers.astype(np.int32), np.concatenate([found[tag][1] for tag in tags]), grey
 
 
+def _guess_tag(
+    grey: UInt8, board: CalibrationBoard, tag: int, near: dict[int, Float64], reach: float
+) -> Float64:
+    """Return corners (4, 2) of a tag beside known ones, the nearer two refined before the others."""
+    flat, wanted = np.concatenate([_tag_m(n, board) for n in near]), _tag_m(tag, board)
+    pixels, guess = np.concatenate(list(near.values())), np.zeros((4, 2))
+    nearest = np.argsort(np.linalg.norm(wanted - flat.mean(axis=0), axis=1))
+    for own in (nearest[:2], nearest[2:]):
+        H, _ = cv2.findHomography(flat, pixels)
+        if H is None:
+            return guess
+        rest = nearest if own[0] == nearest[0] else own
+        guess[rest] = cv2.perspectiveTransform(wanted[None, rest], H)[0]
+        if _outside(grey, guess[rest]):
+            return guess
+        window_px = reach * _free_of_tags(board) * _scales(wanted, guess)
+        guess[own] = refine_corners(grey, guess[own], window_px[own])
+        flat, pixels = np.concatenate([flat, wanted[own]]), np.concatenate([pixels, guess[own]])
+    return guess
+
+
+def _outside(grey: UInt8, pixels: Float64) -> bool:
+    height, width = grey.shape
+    return not ((pixels >= 1) & (pixels <= (width - 2, height - 2))).all()  # NaN, too
+
+
 def _keep_tag(
     found: dict[int, tuple[float, Float64]],
     grey: UInt8,
     board: CalibrationBoard,
     tag: int,
-    quad: Float64,
+    guess: Float64,
 ) -> set[int]:
-    """Add a tag whose bits are read at its refined corners; return it if it is there now."""
-    height, width = grey.shape
-    if (
-        tag >= board.columns * board.rows
-        or (quad < 1).any()
-        or (quad > (width - 2, height - 2)).any()
-    ):
+    """Add a tag whose bits and corners are read at its refined corners; return it if so."""
+    if _outside(grey, guess) or tag >= board.columns * board.rows:
         return set()
-    sides = np.linalg.norm(quad[[1, 3, 0, 2]] - quad[[0, 1, 2, 3]], axis=1)
-    reach_px = np.full(4, sides.min() / board.marker_m * _free_of_tags(board))
-    quad = refine_corners(grey, quad, reach_px)
-    side = _TAG_BITS + 2 * (1 if board.legacy else 2)
-    cells = (np.mgrid[0:_TAG_BITS, 0:_TAG_BITS] + 0.5 - _TAG_BITS / 2) / side + 0.5
-    upright = np.array([[0, 1], [1, 1], [0, 0], [1, 0]], dtype=np.float32)
-    H = cv2.getPerspectiveTransform(upright, quad.astype(np.float32))
-    at = cv2.perspectiveTransform(cells[::-1].reshape(2, 1, -1).T.astype(np.float64), H)
-    seen = cv2.remap(grey, at.astype(np.float32), None, cv2.INTER_LINEAR).ravel()
-    bits = cv2.aruco.generateImageMarker(dictionary(board.dictionary), tag, _TAG_BITS + 2)
-    likeness = (
-        float(np.corrcoef(seen, bits[-2:0:-1, -2:0:-1].ravel())[0, 1]) if np.ptp(seen) else 0.0
-    )
-    if likeness < max(_SAME_TAG, found.get(tag, (0.0,))[0]):
+    quad_m, free_m = _tag_m(tag, board), _free_of_tags(board)
+    reach_px = free_m * _scales(quad_m, guess)
+    quad = refine_corners(grey, guess, reach_px)
+    H = cv2.getPerspectiveTransform(quad_m.astype(np.float32), quad.astype(np.float32))
+
+    def read(places_m: Float64) -> Float64:
+        at = cv2.perspectiveTransform(places_m.reshape(-1, 1, 2), H).astype(np.float32)
+        return cv2.remap(grey, at, None, cv2.INTER_LINEAR).ravel().astype(np.float64)
+
+    bit_m = board.marker_m / (_TAG_BITS + 2 * _border(board))
+    middles_m = (np.mgrid[0:_TAG_BITS, 0:_TAG_BITS][::-1] - (_TAG_BITS - 1) / 2) * bit_m
+    seen = read(quad_m.mean(axis=0) + middles_m.reshape(2, -1).T)
+    shown = cv2.aruco.generateImageMarker(dictionary(board.dictionary), tag, _TAG_BITS + 2)
+    bits = shown[-2:0:-1, -2:0:-1].ravel() > 0
+    likeness = float(np.corrcoef(seen, bits)[0, 1]) if np.ptp(seen) else 0.0
+    # A tag is dark inside of each corner, and the paper beside it light.
+    middle = (seen[bits].mean() + seen[~bits].mean()) / 2
+    outward = np.sign(quad_m - quad_m.mean(axis=0)) * free_m / 2
+    beside = np.stack([read(quad_m + outward * turn) for turn in ((1, -1), (-1, 1))])
+    fits = (read(quad_m - outward) < middle).all() and (beside > middle).all()
+    if not fits or likeness < max(_SAME_TAG, found.get(tag, (0.0,))[0]):
         return set()
     found[tag] = likeness, quad
     return {tag}
@@ -192,15 +227,19 @@ def _tag_m(tag: int, board: CalibrationBoard) -> Float64:
 
 
 def _free_of_tags(board: CalibrationBoard) -> float:
-    bits = 1 if board.legacy else 2
-    border_m = board.marker_m * bits / (_TAG_BITS + 2 * bits)
+    border_m = board.marker_m * _border(board) / (_TAG_BITS + 2 * _border(board))
     return _FREE * min(border_m, board.square_m - board.marker_m)
 
 
+def _border(board: CalibrationBoard) -> int:
+    """Return the width of the dark border of tags, bits."""
+    return 1 if board.legacy else 2
+
+
 @lru_cache(maxsize=2)
-def _tag_detector(thin: bool) -> Any:
+def _tag_detector(border: int) -> Any:
     settings = cv2.aruco.DetectorParameters()
-    settings.markerBorderBits = 1 if thin else 2
+    settings.markerBorderBits = border
     return cv2.aruco.ArucoDetector(dictionary("APRILTAG_36H11"), settings)
 
 
@@ -267,7 +306,7 @@ def _dark_tags(board: CalibrationBoard) -> Float64:
     gap_m, parts = board.square_m - board.marker_m, []
     for tag in range(board.columns * board.rows):
         corners = _tag_m(tag, board)
-        parts.append(_cells(board, tag, corners[2], 1 if board.legacy else 2, turned=True))
+        parts.append(_cells(board, tag, corners[2], _border(board), turned=True))
         parts.append(
             _boxes(corners + gap_m * np.array([[-1, 0], [0, 0], [-1, -1], [0, -1]]), gap_m)
         )

@@ -32,7 +32,7 @@ from recon.rig.calibrate.bundle import (
     squared_errors,
 )
 from recon.rig.settings import CalibrationSettings
-from recon.stereo.rectify.lens import project_into_image, rays_of
+from recon.stereo.rectify.lens import project_into_image, project_raw, rays_of
 
 Size = tuple[int, int]
 # Half fields of view that are tried for a fisheye lens.
@@ -66,8 +66,12 @@ class StereoFit:
     rms_px: float  # rms reprojection error over all corners of both cameras
 
 
-def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSettings) -> StereoFit:
+def calibrate_stereo(
+    views: Sequence[View], size: Size, settings: CalibrationSettings, circle_m: float = 0.0
+) -> StereoFit:
     """Calibrate two cameras: each alone, then all parameters of both together.
+
+    ``circle_m`` is the diameter of circles whose centroids are given; 0 = the views are corners.
 
     Ref: Zhang 2000; the lens models are OpenCV's.
     """
@@ -100,6 +104,9 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
     rms_px = math.sqrt(float(sums.sum() / counts.sum()))
     left_px, right_px = (math.sqrt(float((errors**2).mean())) for errors in alone)
     _check_fit(rms_px, (left_px, right_px))
+    if circle_m:
+        fit = calibrate_stereo(_centred(kept, state, circle_m), size, settings)
+        return replace(fit, repeated=repeated, dropped=dropped | fit.dropped)
     return StereoFit(
         calibration=stereo_of(state),
         state=state,
@@ -111,6 +118,28 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
         alone_px=(left_px, right_px),
         rms_px=rms_px,
     )
+
+
+def _centred(views: Sequence[View], state: RigState, circle_m: float) -> list[View]:
+    """Return views with the images of the centres of circles, which are not their centroids."""
+    turn = np.linspace(0.0, 2 * math.pi, 32, endpoint=False)
+    ring = circle_m / 2 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+
+    def shifted(seen: Sighting, camera: CameraIntrinsics, T_camera_board: Float64) -> Sighting:
+        around = apply(T_camera_board, (seen.board_m[:, None] + ring).reshape(-1, 3))
+        u, v = project_raw(camera, around).reshape(-1, len(ring), 2).transpose(2, 0, 1)
+        nu, nv = (np.roll(each, -1, axis=1) for each in (u, v))
+        area = u * nv - nu * v  # twice that of each triangle with the origin
+        centroid = np.stack([((u + nu) * area).sum(axis=1), ((v + nv) * area).sum(axis=1)], axis=1)
+        middle = project_raw(camera, apply(T_camera_board, seen.board_m))
+        moved_px = middle - centroid / (3 * area.sum(axis=1)[:, None])
+        return replace(seen, pixels=seen.pixels + moved_px)
+
+    return [
+        replace(view, seen=tuple(map(shifted, view.seen, state.cameras, T @ T_rig_board)))
+        for T in [np.stack(state.T_camera_rig)]
+        for view, T_rig_board in zip(views, state.T_rig_board, strict=True)
+    ]
 
 
 def stereo_of(state: RigState) -> StereoCalibration:
