@@ -80,8 +80,8 @@ def calibrate(
     with shared.one_line_errors():
         from recon.commands.cameras import run_calibrate
         from recon.commands.config import load_config
-        from recon.io.cameras.targets import read_board
         from recon.io.atomic import check_targets
+        from recon.io.cameras.targets import read_board
         from recon.rig.written import form_of, targets_of
 
         if out is not None:

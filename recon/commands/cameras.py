@@ -22,7 +22,7 @@ from recon.report.audit_page import write_audit_page
 from recon.report.calibration_page import write_calibration_page, write_epipolar_images
 from recon.rig.audit import Audit, audit_source, correct_calibration
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
-from recon.rig.calibrate.stereo import calibrate_stereo, measure_spread
+from recon.rig.calibrate.stereo import calibrate_stereo, compare_lenses, measure_spread
 from recon.rig.calibrate.verdict import (
     CalibrationResult,
     describe_calibration,
@@ -93,7 +93,9 @@ def run_calibrate(
             fit = calibrate_stereo(seen.views, seen.size_px, config.calibration, circle_m)
         with run.stage("bootstrap"), serial_algebra():
             spread = measure_spread(fit, config.calibration)
-        result = describe_calibration(seen, fit, spread, config, images)
+        with run.stage("compare"), serial_algebra():
+            lenses = compare_lenses(fit, seen.size_px, config.calibration)
+        result = describe_calibration(seen, fit, spread, config, images, lenses)
         write_calibration(run.path("calibration.yaml"), result, "recon")
         summary = result.summary
         if file is not None:

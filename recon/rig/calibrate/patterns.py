@@ -149,7 +149,7 @@ def _find_tags(grey: UInt8, board: CalibrationBoard) -> Found | None:
 def _guess_tag(
     grey: UInt8, board: CalibrationBoard, tag: int, near: dict[int, Float64], reach: float
 ) -> Float64:
-    """Return corners (4, 2) of a tag beside known ones, the nearer two refined before the others."""
+    """Return corners (4, 2) of a tag beside known ones, the nearer two refined first."""
     flat, wanted = np.concatenate([_tag_m(n, board) for n in near]), _tag_m(tag, board)
     pixels, guess = np.concatenate(list(near.values())), np.zeros((4, 2))
     nearest = np.argsort(np.linalg.norm(wanted - flat.mean(axis=0), axis=1))

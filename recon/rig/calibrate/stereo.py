@@ -10,17 +10,18 @@ import math
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, get_args
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply, exp_so3, invert, log_so3, make_transform
 from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values import CameraIntrinsics, StereoCalibration
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
 from recon.rig.calibrate.bundle import (
     Information,
     RigState,
@@ -31,7 +32,7 @@ from recon.rig.calibrate.bundle import (
     solve_scaled,
     squared_errors,
 )
-from recon.rig.settings import CalibrationSettings
+from recon.rig.settings import CalibrationSettings, LensKind
 from recon.stereo.rectify.lens import project_into_image, project_raw, rays_of
 
 Size = tuple[int, int]
@@ -305,12 +306,12 @@ def _view_errors(views: Sequence[View], state: RigState) -> Float64:
     return np.asarray(np.sqrt(sums.sum(axis=1) / counts.sum(axis=1)))
 
 
-_PLACES: Final = (0.2, 0.5, 0.8)  # depth errors are those of a 3 by 3 grid in the left image
-_MIDDLE: Final = 4
+CELLS: Final = (8, 6)  # image cells; without corners in one, the lens is extrapolated there
 _MATCHED: Final = 0.02  # relative error of matching at the default working distance
 MATCH_SIGMA_PX: Final = 0.25  # assumed matching error, by which depth errors are predicted
-DEPTHS_M: Final = (2.0, 5.0, 10.0, 20.0)  # depths at which the error is predicted
+_DEPTHS: Final = (1, 2, 5, 10)  # where the error is predicted, relative to the board's distance
 _RESAMPLES: Final = 500
+_ONE_SIGMA: Final = 0.6827  # of a normal distribution
 CONFIDENCE: Final = 0.95  # confidence level of the intervals
 
 
@@ -319,7 +320,7 @@ class DepthError:
     """Predicted depth error at one distance along the optical axis of the left camera."""
 
     depth_m: float  # the distance
-    calibration_m: float  # rms error over resamples and image; NaN = the views do not overlap
+    calibration_m: float  # standard error where corners were seen, rms over the image; NaN = the views do not overlap
     low_m: float  # interval of the error at the image centre; negative = measured too near
     high_m: float
     matching_m: float  # error due to matching, with `MATCH_SIGMA_PX`
@@ -367,12 +368,13 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
     """Return bootstrap intervals of focal length, baseline, rotation and depth."""
     rigs = _resample(fit)
     turns = [rig.T_right_left[:3, :3] @ fit.calibration.T_right_left[:3, :3].T for rig in rigs]
+    away_m = float(np.median(distances_m(fit)))
     cosines = np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1)
     return Spread(
         focal_px=_interval([rig.left.matrix[0, 0] for rig in rigs]),
         baseline_m=_interval([rig.baseline_m for rig in rigs]),
         rotation_deg=float(np.degrees(np.sqrt(np.mean(np.arccos(cosines) ** 2)))),
-        depths=tuple(_depth_error(fit, rigs, depth) for depth in DEPTHS_M),
+        depths=tuple(_depth_error(fit, rigs, float(f"{n * away_m:.1g}")) for n in _DEPTHS),
         working=_depth_error(fit, rigs, _working_distance(fit.calibration, settings)),
     )
 
@@ -403,19 +405,104 @@ def _interval(values: list[float]) -> tuple[float, float]:
 
 def _depth_error(fit: StereoFit, rigs: list[StereoCalibration], depth_m: float) -> DepthError:
     rig = fit.calibration
-    width, height = rig.left.width_px, rig.left.height_px
-    places = np.array([[x * width, y * height] for y in _PLACES for x in _PLACES])
+    left_seen, right_seen = (seen_cells(fit, side) for side in (0, 1))
+    size = np.array([rig.left.width_px, rig.left.height_px])
+    middle_px = np.array([size / 2])
+    places = np.concatenate([middle_px, (np.argwhere(left_seen) + 0.5) / CELLS * size])
     xyz = rays_of(rig.left, places) * depth_m
     right_px = project_into_image(rig.right, apply(rig.T_right_left, xyz))
     shared = np.asarray(np.isfinite(right_px).all(axis=1))
     focal_px = float(rig.left.matrix[0, 0])
     matching_m = depth_m**2 * MATCH_SIGMA_PX / (focal_px * rig.baseline_m)
-    if not shared[_MIDDLE]:
+    if not shared[0]:
         return DepthError(depth_m, np.nan, np.nan, np.nan, matching_m)
-    seen = places[shared], right_px[shared]
-    errors = np.array([measure_depth(other, *seen) - depth_m for other in rigs])
-    middle = errors[:, int(shared[:_MIDDLE].sum())]
-    low_m, high_m = _interval(list(middle))
-    # NaN: the lens of a resample may not be invertible at the image border.
-    rms_m = float(np.sqrt(np.nanmean(errors**2)))
+    # Elsewhere the lens is extrapolated, of which the coverage tells.
+    shared[shared] = right_seen[cells_of(right_px[shared], rig.right)]
+    shared[0] = True
+    errors = np.array([measure_depth(r, places[shared], right_px[shared]) for r in rigs]) - depth_m
+    low_m, high_m = _interval(list(errors[:, 0]))
+    # The few resamples that determine a lens badly do not count for more than they are. NaN: the
+    # lens of one may not be invertible at the image border.
+    aside = (1 - _ONE_SIGMA) / 2
+    low, high = np.nanquantile(errors, (aside, 1 - aside), axis=0)
+    rms_m = float(np.sqrt(np.nanmean(((high - low) / 2) ** 2)))
     return DepthError(depth_m, rms_m, low_m, high_m, matching_m)
+
+
+def cells_of(pixels: Float64, camera: CameraIntrinsics) -> tuple[NDArray[np.intp], ...]:
+    """Return column and row (N,) of the cells of an image in which pixels (N, 2) are."""
+    size = np.array([camera.width_px, camera.height_px])
+    cells = np.floor((pixels + 0.5) / size * CELLS).astype(np.intp)
+    return tuple(np.clip(cells, 0, np.array(CELLS) - 1).T)
+
+
+def seen_cells(fit: StereoFit, side: int) -> Bool:
+    """Return bool `CELLS`: in which cells of an image a corner was seen."""
+    seen = np.zeros(CELLS, dtype=bool)
+    pixels = np.concatenate([view.seen[side].pixels for view in fit.views])
+    seen[cells_of(pixels, fit.state.cameras[side])] = True
+    return seen
+
+
+def distances_m(fit: StereoFit) -> Float64:
+    """Return float64 (V,), distance of the middle of the board from the left camera."""
+    middles = [
+        (T @ [*view.seen[0].board_m.mean(axis=0), 1.0])[:3]
+        for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
+    ]
+    return np.asarray(np.linalg.norm(middles, axis=1))
+
+
+def _held_out(fit: StereoFit) -> Float64:
+    """Return float64 (V,), mean squared error of each view if the rig is fitted to the others, px².
+
+    A lens with too many coefficients fits the views well, and those that it has not seen worse.
+    """
+    info, (sums, counts) = fit.information, squared_errors(fit.views, fit.state)
+    whole, errors = info.prior + info.matrices.sum(axis=0), sums.sum(axis=1)
+    for number, (M, v) in enumerate(zip(info.matrices, info.vectors, strict=True)):
+        step = solve_scaled(whole - M, v)  # back, from the solution to that without the view
+        errors[number] += 2 * v @ step + step @ M @ step
+    return np.asarray(errors / counts.sum(axis=1))
+
+
+@dataclass(frozen=True)
+class LensChoice:
+    """How well a lens model suits the views of a rig."""
+
+    held_out_px: float  # rms error of views that are left out of the fit
+    coefficients: int  # of both cameras
+    working_ratio: float  # expected depth error at the working distance, relative to it
+    suits: bool  # whether no other model fits views that are left out better, beyond chance
+
+
+def compare_lenses(
+    fit: StereoFit, size: Size, settings: CalibrationSettings
+) -> dict[str, LensChoice]:
+    """Compare all lens models on the views of ``fit``, which has that of the settings.
+
+    A model is left out if it does not fit all of these views.
+    """
+    fits, errors = {}, {}
+    for model in get_args(LensKind):
+        with suppress(CalibrationError):
+            own = settings.model_copy(update={"model": model})
+            other = fit if model == settings.model else calibrate_stereo(fit.views, size, own)
+            if len(other.views) == len(fit.views):
+                fits[model], errors[model] = other, _held_out(other)
+    if not fits:
+        return {}
+    least = errors[min(errors, key=lambda model: float(errors[model].mean()))]
+    found = {}
+    for model, other in fits.items():
+        worse = errors[model] - least
+        depth_m = _working_distance(other.calibration, settings)
+        error_m = _depth_error(other, _resample(other), depth_m).calibration_m
+        found[model] = LensChoice(
+            held_out_px=math.sqrt(float(errors[model].mean())),
+            coefficients=sum(camera.distortion.size for camera in other.state.cameras),
+            working_ratio=error_m / depth_m,
+            # One standard error of the mean of the difference.
+            suits=bool(worse.mean() <= worse.std() / math.sqrt(len(worse))),
+        )
+    return found

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import numpy as np
 
 from recon.core.summary import Rows, RunSummary, inline, optional, shown_path
 from recon.core.text import counted, metres
-from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.figures import CalibrationFigures, DepthErrorCm, WorkingError
-from recon.rig.calibrate.stereo import Spread, StereoFit
+from recon.rig.calibrate.stereo import (
+    LensChoice,
+    Spread,
+    StereoFit,
+    distances_m,
+    seen_cells,
+)
 from recon.rig.settings import CalibratedSettings
 from recon.rig.written import CalibrationForm, write_rig
 from recon.sources.images import ImagePairs
@@ -72,6 +78,10 @@ _TEXTS: Final = {
     "times as far as the nearest",
     "sharpness": "corners fit to {stereo_rms_px:.2f} px only: focus, light, a flat board, and hold "
     "it still",
+    "model": "{best} fits the lens better: {lens.held_out_px:.2f} px in views that are left out, "
+    "against {own.held_out_px:.2f}{fewer}; --model {best}",
+    "lens": "no lens model fits views that are held out: {errors}; is the board flat and the image "
+    "sharp?",
     "more": f"take more views: {{views_used}} different ones, {_ENOUGH_VIEWS} are good",
 }
 _NOTHING_LACKS: Final = "the views lack nothing: take more of their kind"
@@ -95,7 +105,10 @@ def verdict_of_calibration(findings: Sequence[CalibrationFinding]) -> Verdict:
 
 
 def judge_calibration(
-    board: CalibrationBoard, images: ImagePairs, figures: CalibrationFigures
+    board: CalibrationBoard,
+    images: ImagePairs,
+    figures: CalibrationFigures,
+    lens: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> list[CalibrationFinding]:
     """Return all findings of a calibration, the gravest first."""
     known = figures.to_json()
@@ -111,10 +124,10 @@ def judge_calibration(
         "fatal" if ratio is None or ratio > _USABLE else "warning", _depth_faults(board, figures)
     )
     found += described("warning", _doubts(board, figures))
-    lacking: list[CalibrationFinding] = []
+    lacking = described("note", iter(lens))
     if verdict_of_calibration(found) != "good":
         nothing = CalibrationFinding("more", "note", _NOTHING_LACKS)
-        lacking = described("note", _lacks(figures)) or [nothing]
+        lacking = [*lacking, *described("note", _lacks(figures))] or [nothing]
     return [*found, *described("note", _left_out(board, images, figures)), *lacking]
 
 
@@ -179,6 +192,19 @@ def _lacks(found: CalibrationFigures) -> Found:
         yield "more", {}
 
 
+def _lens(lenses: Mapping[str, LensChoice], model: str) -> Found:
+    """Yield a model that suits the lens better, or that none does."""
+    own, suiting = lenses.get(model), [name for name, lens in lenses.items() if lens.suits]
+    best = min(suiting, key=lambda name: lenses[name].working_ratio, default=model)
+    if own is not None and best != model and (not own.suits or own.working_ratio > _GOOD):
+        fewer = own.coefficients - lenses[best].coefficients
+        text = f", with {fewer} fewer coefficients" if fewer > 0 else ""
+        yield "model", {"best": best, "lens": lenses[best], "own": own, "fewer": text}
+    if lenses and min(lens.held_out_px for lens in lenses.values()) > _SHARP_PX:
+        errors = ", ".join(f"{name} {lens.held_out_px:.2f} px" for name, lens in lenses.items())
+        yield "lens", {"errors": errors}
+
+
 def _length(metres: float, board: CalibrationBoard) -> str:
     if not board.metric:
         return f"{metres:.3g} squares"
@@ -189,7 +215,6 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
-_CELLS: Final = (8, 6)  # image cells; without corners in one, the lens is extrapolated there
 _DEPTH_CM: Final = ("calibration", "low", "high", "matching")  # of each `DepthError`
 # Figures that are also written into the calibration file.
 _KEPT: Final = (
@@ -256,6 +281,7 @@ def describe_calibration(
     spread: Spread,
     config: CalibratedSettings,
     images: ImagePairs,
+    lenses: Mapping[str, LensChoice] = MappingProxyType({}),
 ) -> CalibrationResult:
     """Rectify the views with the calibrated rig, measure how well it describes them, and judge."""
     turns = plan_turns(fit.calibration, config.rectification)
@@ -265,7 +291,12 @@ def describe_calibration(
         rows.append(left[:, 1] - turns.place(fit.calibration, right_px, right=True)[:, 1])
     epipolar_error_px = np.concatenate(rows)
     figures = _figures(seen, fit, spread, epipolar_error_px, turns.camera.focal_px)
-    findings = judge_calibration(seen.board, images, figures)
+    figures = replace(
+        figures, held_out_px={name: lens.held_out_px for name, lens in lenses.items()}
+    )
+    findings = judge_calibration(
+        seen.board, images, figures, list(_lens(lenses, config.calibration.model))
+    )
     summary = CalibrationSummary(
         figures=figures,
         model=config.calibration.model,
@@ -293,7 +324,7 @@ def _figures(
     epipolar_error_px: Float64,
     rectified_focal_px: float,
 ) -> CalibrationFigures:
-    rig, away_m, away = fit.calibration, _distances_m(fit), spread.working
+    rig, away_m, away = fit.calibration, distances_m(fit), spread.working
     # Angles between the board's normal and the optical axis of the left camera.
     tilts_deg = np.degrees(np.arccos(np.clip(np.abs(fit.state.T_rig_board[:, 2, 2]), 0.0, 1.0)))
     return CalibrationFigures(
@@ -322,8 +353,8 @@ def _figures(
             view.name: [float(value) for value in errors]
             for view, errors in zip(fit.views, fit.errors_px, strict=True)
         },
-        coverage_left=_coverage([view.seen[0].pixels for view in fit.views], rig.left),
-        coverage_right=_coverage([view.seen[1].pixels for view in fit.views], rig.right),
+        coverage_left=float(seen_cells(fit, 0).mean()),
+        coverage_right=float(seen_cells(fit, 1).mean()),
         tilt_max_deg=float(tilts_deg.max()),
         tilted_ratio=float((tilts_deg >= TILT_DEG).mean()),
         far_to_near=float(away_m.max() / away_m.min()),
@@ -354,20 +385,3 @@ def shared_pixels(view: View) -> tuple[Float64, Float64]:
     left, right = view.seen
     _, of_left, of_right = np.intersect1d(left.numbers, right.numbers, return_indices=True)
     return left.pixels[of_left], right.pixels[of_right]
-
-
-def _coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
-    """Return the fraction of image cells in which a corner was seen, in [0, 1]."""
-    size = np.array([camera.width_px, camera.height_px])
-    cells = np.floor((np.concatenate(pixels) + 0.5) / size * _CELLS).astype(int)
-    inside = np.clip(cells, 0, np.array(_CELLS) - 1)
-    return len(np.unique(inside, axis=0)) / (_CELLS[0] * _CELLS[1])
-
-
-def _distances_m(fit: StereoFit) -> Float64:
-    """Return float64 (V,), distance of the middle of the board from the left camera."""
-    middles = [
-        (T @ [*view.seen[0].board_m.mean(axis=0), 1.0])[:3]
-        for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
-    ]
-    return np.asarray(np.linalg.norm(middles, axis=1))
