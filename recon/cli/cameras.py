@@ -271,6 +271,9 @@ def capture(
     rate: Annotated[
         float | None, opt.setting("capture.rate_hz", "Requested frame rate, in frames per second.")
     ] = None,
+    board: Annotated[
+        str | None, opt.option("Say which views of this board are missing, see recon board.")
+    ] = None,
     preview: Annotated[int | None, opt.option("Update preview.jpg every N pairs.", min=1)] = None,
     *,
     shared: opt.Asked,
@@ -282,10 +285,12 @@ def capture(
 
     Examples:
       recon capture 0 2 --out rides/today --calib stereo.yaml --size 1280x720
+      recon capture 0 2 --out views --board chess:9x6:25mm
       recon capture /dev/video4 --out rides/today --set capture.suffix=jpg
     """
     with shared.one_line_errors():
         from recon.commands.cameras import run_capture
+        from recon.io.cameras.targets import read_board
         from recon.rig.capture import RecordingSettings
 
         known = shared.settings()
@@ -294,5 +299,8 @@ def capture(
         settings = RecordingSettings.parse({**dict(known.capture), **views, **limits})
         devices = [left] if right is None else [left, right]
         with until_interrupted() as stopped:
-            summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)
+            shown = None if board is None else read_board(board)
+            summary = run_capture(
+                devices, out, settings, calibration=calib, board=shown, stopped=stopped
+            )
     print_summary(summary, as_json=shared.json)

@@ -22,6 +22,7 @@ from recon.report.audit_page import write_audit_page
 from recon.report.calibration_page import write_calibration_page, write_epipolar_images
 from recon.rig.audit import Audit, audit_source, correct_calibration
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
+from recon.rig.calibrate.guide import BoardGuide, guided
 from recon.rig.calibrate.stereo import calibrate_stereo, compare_lenses, measure_spread
 from recon.rig.calibrate.verdict import (
     CalibrationResult,
@@ -179,18 +180,20 @@ def run_capture(
     settings: RecordingSettings,
     *,
     calibration: Path | None = None,
+    board: CalibrationBoard | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> CaptureSummary:
     """Record until stopped; with a calibration, the folder can be mapped as it is.
 
     ``devices`` are left and right camera, or one with both views: numbers, paths or video files.
     The folder must be new or empty; its ``capture.json`` gets the figures that are returned.
-    ``stopped`` is called before each pair.
+    ``stopped`` is called before each pair. With a ``board``, it says while recording which views
+    are missing.
     """
     if calibration is not None and not calibration.is_file():
         raise FormatError("file does not exist", where=calibration)
     with open_cameras(devices, settings) as cameras:
-        return record(cameras, folder, settings, calibration, stopped)
+        return record(cameras, folder, settings, calibration, stopped, board)
 
 
 def record(
@@ -199,8 +202,10 @@ def record(
     settings: RecordingSettings,
     calibration: Path | None,
     stopped: Callable[[], bool],
+    board: CalibrationBoard | None = None,
 ) -> CaptureSummary:
     """Record from opened cameras; see `run_capture`."""
+    guide = None if board is None else BoardGuide(board)
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     with CaptureFolder(folder, settings.suffix) as target:
         if calibration is not None:
@@ -209,6 +214,7 @@ def record(
         try:
             pairs = capture_pairs(cameras, settings, stopped)
             shown = tracked(pairs, "pairs", "record", total=settings.frames)
+            shown = shown if guide is None else guided(shown, guide)
             write_pairs(shown, target, settings.preview_every)
         finally:
             summary = CaptureSummary(
@@ -217,6 +223,7 @@ def record(
                 exposure_locked=locked,
                 figures=target.figures,
                 calibration=calibration is not None,
+                board=None if guide is None else guide.advice(),
                 out=str(folder),
             )
             if target.frames:  # else it has no summary

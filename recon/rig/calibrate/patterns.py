@@ -189,7 +189,7 @@ def _keep_tag(
 
     def read(places_m: Float64) -> Float64:
         at = cv2.perspectiveTransform(places_m.reshape(-1, 1, 2), H).astype(np.float32)
-        return cv2.remap(grey, at, None, cv2.INTER_LINEAR).ravel().astype(np.float64)
+        return np.asarray(cv2.remap(grey, at, None, cv2.INTER_LINEAR), dtype=np.float64).ravel()
 
     bit_m = board.marker_m / (_TAG_BITS + 2 * _border(board))
     middles_m = (np.mgrid[0:_TAG_BITS, 0:_TAG_BITS][::-1] - (_TAG_BITS - 1) / 2) * bit_m
@@ -276,7 +276,8 @@ def _refine_circles(grey: UInt8, pixels: Float64, reach_px: Float64) -> Float64:
 
 def dark_polygons(board: CalibrationBoard) -> Float64:
     """Return float64 (M, K, 2), outlines of what is dark, metres from the first corner."""
-    return PATTERNS[board.kind].draw(board)
+    drawn: Float64 = PATTERNS[board.kind].draw(board)
+    return drawn
 
 
 def _boxes(low: Float64, size: float | Float64) -> Float64:

@@ -320,7 +320,8 @@ class DepthError:
     """Predicted depth error at one distance along the optical axis of the left camera."""
 
     depth_m: float  # the distance
-    calibration_m: float  # standard error where corners were seen, rms over the image; NaN = the views do not overlap
+    # standard error where corners were seen, rms over the image; NaN = the views do not overlap
+    calibration_m: float
     low_m: float  # interval of the error at the image centre; negative = measured too near
     high_m: float
     matching_m: float  # error due to matching, with `MATCH_SIGMA_PX`

@@ -43,10 +43,10 @@ _APART: Final = 2.0  # stereo error relative to that of each camera alone
 _ROWS_PX: Final = 1.0  # a block matcher loses most matches to a epipolar error of one pixel
 _USUAL_BASELINE_M: Final = (0.01, 2.0)
 # What a good set of views has, used to say what another one lacks.
-_ENOUGH_VIEWS: Final = 20
-_COVERED: Final = 0.8
-_TILTED: Final = 0.5
-_FAR_TO_NEAR: Final = 2.0
+ENOUGH_VIEWS: Final = 20
+COVERED: Final = 0.8
+TILTED: Final = 0.5
+FAR_TO_NEAR: Final = 2.0
 TILT_DEG: Final = 20.0  # a board turned away by this much determines the focal length
 _SHARP_PX: Final = 0.5
 _UNSURE_FOCAL: Final = 0.01  # half of the interval, relative to the focal length
@@ -55,7 +55,7 @@ _TEXTS: Final = {
     "overlap": "both cameras have no common view at {at}",
     "depth": "depth at {at} is expected to be wrong by {wrong} ({percent:.1f} %) because of the "
     f"calibration; up to {100 * _GOOD:.0f} % is good, up to {100 * _USABLE:.0f} % usable",
-    "views": f"only {{views}}: the expected error is unsure; take {_ENOUGH_VIEWS}",
+    "views": f"only {{views}}: the expected error is unsure; take {ENOUGH_VIEWS}",
     "coverage": "the board was seen in {percent:.0f} % of the {side} image: the lens is guessed "
     "elsewhere; show it in every corner",
     "together": "both cameras together fit worse than alone: not synchronised, or moved?",
@@ -70,7 +70,7 @@ _TEXTS: Final = {
     "repeats": "{views} with the board where another one has it, counted once; move and tilt it "
     "between two views",
     "corners": "bring the board closer to the corners: seen in {percent:.0f} % of the {side} "
-    f"image, {100 * _COVERED:.0f} % is good",
+    f"image, {100 * COVERED:.0f} % is good",
     "tilt": f"tilt the board more: by {TILT_DEG:.0f} degrees or more in "
     "{percent:.0f} % of the views, half of them is good",
     "focal": "focal length is unsure: {low:.1f} to {high:.1f} px; take more tilted views",
@@ -82,7 +82,7 @@ _TEXTS: Final = {
     "against {own.held_out_px:.2f}{fewer}; --model {best}",
     "lens": "no lens model fits views that are held out: {errors}; is the board flat and the image "
     "sharp?",
-    "more": f"take more views: {{views_used}} different ones, {_ENOUGH_VIEWS} are good",
+    "more": f"take more views: {{views_used}} different ones, {ENOUGH_VIEWS} are good",
 }
 _NOTHING_LACKS: Final = "the views lack nothing: take more of their kind"
 
@@ -177,22 +177,22 @@ def _left_out(board: CalibrationBoard, images: ImagePairs, found: CalibrationFig
 
 def _lacks(found: CalibrationFigures) -> Found:
     ratio, side = min((found.coverage_left, "left"), (found.coverage_right, "right"))
-    if _SMALL_COVERAGE <= ratio < _COVERED:
+    if _SMALL_COVERAGE <= ratio < COVERED:
         yield "corners", {"percent": 100 * ratio, "side": side}
-    if found.tilted_ratio < _TILTED:
+    if found.tilted_ratio < TILTED:
         yield "tilt", {"percent": 100 * found.tilted_ratio}
     low, high = found.focal_interval_px
     if high - low > 2 * _UNSURE_FOCAL * found.focal_px:
         yield "focal", {"low": low, "high": high}
-    if found.far_to_near < _FAR_TO_NEAR:
+    if found.far_to_near < FAR_TO_NEAR:
         yield "distances", {}
     if found.stereo_rms_px > _SHARP_PX:
         yield "sharpness", {}
-    if _FEW_VIEWS <= found.views_used < _ENOUGH_VIEWS:
+    if _FEW_VIEWS <= found.views_used < ENOUGH_VIEWS:
         yield "more", {}
 
 
-def _lens(lenses: Mapping[str, LensChoice], model: str) -> Found:
+def lens_faults(lenses: Mapping[str, LensChoice], model: str) -> Found:
     """Yield a model that suits the lens better, or that none does."""
     own, suiting = lenses.get(model), [name for name, lens in lenses.items() if lens.suits]
     best = min(suiting, key=lambda name: lenses[name].working_ratio, default=model)
@@ -295,7 +295,7 @@ def describe_calibration(
         figures, held_out_px={name: lens.held_out_px for name, lens in lenses.items()}
     )
     findings = judge_calibration(
-        seen.board, images, figures, list(_lens(lenses, config.calibration.model))
+        seen.board, images, figures, list(lens_faults(lenses, config.calibration.model))
     )
     summary = CalibrationSummary(
         figures=figures,

@@ -44,7 +44,7 @@ def seen_wide(text: str, blur_px: float = BLUR_PX) -> list[tuple[UInt8, Float64]
     camera, board = wide_camera(), parse_board(text)
     renderer, rng = BoardRenderer(camera, board), np.random.default_rng(4)
     shown = []
-    for x, y, tilt, away in [(0, 0, 0.3, 0.6), (0.5, 0.3, -0.4, 0.65), (-0.6, -0.2, 0.4, 0.6)]:
+    for x, y, tilt, away in [(0, 0, 0.3, 0.6), (0.5, 0.3, -0.1, 0.6), (-0.6, -0.2, 0.1, 0.6)]:
         T = facing(board, x, y, tilt, away)
         blurred = cv2.GaussianBlur(renderer.render(T).astype(np.float64), (0, 0), blur_px)
         noisy = blurred + rng.normal(0, NOISE_DN, blurred.shape)
