@@ -23,7 +23,8 @@ from recon.report.calibration_page import write_calibration_page, write_epipolar
 from recon.rig.audit import Audit, audit_source, correct_calibration
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
 from recon.rig.calibrate.guide import BoardGuide, guided
-from recon.rig.calibrate.stereo import calibrate_stereo, compare_lenses, measure_spread
+from recon.rig.calibrate.lenses import compare_lenses
+from recon.rig.calibrate.stereo import calibrate_stereo, measure_spread
 from recon.rig.calibrate.verdict import (
     CalibrationResult,
     describe_calibration,

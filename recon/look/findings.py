@@ -45,8 +45,8 @@ _TEXTS: Final = {
     "size error": "{error}",
     "black": "the {side} camera shows nothing: its images are uniform, at grey level {mean:.0f} of "
     "255; check its cable, its lens cap and its exposure (16-bit images must fill their range)",
-    "dark": "the {side} images are dark: mean grey level {mean:.0f} of 255, at which faint texture "
-    "is lost in noise; more light, a longer exposure (at low speed), or more gain",
+    "dark": "images of the {side} camera are dark: mean grey level {mean:.0f} of 255, where faint "
+    "texture is lost in noise; more light, a longer exposure (at low speed), or more gain",
     "gain": "the right camera is {gain:.2f} times as bright as the left one; give both the same "
     "fixed exposure and gain{other}",
     "blur": "the {side} camera is blurred: sharpness {worse:.2f}, the other {better:.2f}; focus it "

@@ -5,6 +5,6 @@
 - `guide.py`: what views lack while they are recorded;
 - `stereo.py`: first guesses, both cameras without the views that do not fit, and how sure the fit
   is; `bundle.py`: the solver;
-- `figures.py`: how well it describes the views; `verdict.py`: all of it, its files, and what it is
-  good for.
+- `lenses.py`: which lens model suits; `figures.py`: how well it describes the views; `verdict.py`:
+  all of it, its files, and what it is good for.
 """

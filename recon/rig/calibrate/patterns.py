@@ -270,14 +270,15 @@ def _refine_circles(grey: UInt8, pixels: Float64, reach_px: Float64) -> Float64:
         weight = np.clip((light - part) / max(light - dark, 1.0), 0.0, 1.0)
         weight[np.hypot(x + low[0] - centre[0], y + low[1] - centre[1]) > reach] = 0.0
         weight[weight < 0.2] = 0.0  # noise of the paper
-        refined[number] = low + np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
-    return refined
+        if weight.any():
+            place = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
+            refined[number] = low + place
+    return np.asarray(refined)
 
 
 def dark_polygons(board: CalibrationBoard) -> Float64:
     """Return float64 (M, K, 2), outlines of what is dark, metres from the first corner."""
-    drawn: Float64 = PATTERNS[board.kind].draw(board)
-    return drawn
+    return np.asarray(PATTERNS[board.kind].draw(board))
 
 
 def _boxes(low: Float64, size: float | Float64) -> Float64:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Final, get_args
+from typing import Final
 
 import cv2
 import numpy as np
@@ -32,7 +32,7 @@ from recon.rig.calibrate.bundle import (
     solve_scaled,
     squared_errors,
 )
-from recon.rig.settings import CalibrationSettings, LensKind
+from recon.rig.settings import CalibrationSettings
 from recon.stereo.rectify.lens import project_into_image, project_raw, rays_of
 
 Size = tuple[int, int]
@@ -380,6 +380,12 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
     )
 
 
+def expected_ratio(fit: StereoFit, settings: CalibrationSettings) -> float:
+    """Return the expected depth error at the working distance, relative to it; NaN = no overlap."""
+    depth_m = _working_distance(fit.calibration, settings)
+    return _depth_error(fit, _resample(fit), depth_m).calibration_m / depth_m
+
+
 def _working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
     """Return the distance at which depth matters: by default, where matching errs by 2 %."""
     usual_m = _MATCHED * float(rig.left.matrix[0, 0]) * rig.baseline_m / MATCH_SIGMA_PX
@@ -452,58 +458,3 @@ def distances_m(fit: StereoFit) -> Float64:
         for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
     ]
     return np.asarray(np.linalg.norm(middles, axis=1))
-
-
-def _held_out(fit: StereoFit) -> Float64:
-    """Return float64 (V,), mean squared error of each view if the rig is fitted to the others, px².
-
-    A lens with too many coefficients fits the views well, and those that it has not seen worse.
-    """
-    info, (sums, counts) = fit.information, squared_errors(fit.views, fit.state)
-    whole, errors = info.prior + info.matrices.sum(axis=0), sums.sum(axis=1)
-    for number, (M, v) in enumerate(zip(info.matrices, info.vectors, strict=True)):
-        step = solve_scaled(whole - M, v)  # back, from the solution to that without the view
-        errors[number] += 2 * v @ step + step @ M @ step
-    return np.asarray(errors / counts.sum(axis=1))
-
-
-@dataclass(frozen=True)
-class LensChoice:
-    """How well a lens model suits the views of a rig."""
-
-    held_out_px: float  # rms error of views that are left out of the fit
-    coefficients: int  # of both cameras
-    working_ratio: float  # expected depth error at the working distance, relative to it
-    suits: bool  # whether no other model fits views that are left out better, beyond chance
-
-
-def compare_lenses(
-    fit: StereoFit, size: Size, settings: CalibrationSettings
-) -> dict[str, LensChoice]:
-    """Compare all lens models on the views of ``fit``, which has that of the settings.
-
-    A model is left out if it does not fit all of these views.
-    """
-    fits, errors = {}, {}
-    for model in get_args(LensKind):
-        with suppress(CalibrationError):
-            own = settings.model_copy(update={"model": model})
-            other = fit if model == settings.model else calibrate_stereo(fit.views, size, own)
-            if len(other.views) == len(fit.views):
-                fits[model], errors[model] = other, _held_out(other)
-    if not fits:
-        return {}
-    least = errors[min(errors, key=lambda model: float(errors[model].mean()))]
-    found = {}
-    for model, other in fits.items():
-        worse = errors[model] - least
-        depth_m = _working_distance(other.calibration, settings)
-        error_m = _depth_error(other, _resample(other), depth_m).calibration_m
-        found[model] = LensChoice(
-            held_out_px=math.sqrt(float(errors[model].mean())),
-            coefficients=sum(camera.distortion.size for camera in other.state.cameras),
-            working_ratio=error_m / depth_m,
-            # One standard error of the mean of the difference.
-            suits=bool(worse.mean() <= worse.std() / math.sqrt(len(worse))),
-        )
-    return found

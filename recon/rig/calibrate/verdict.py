@@ -17,8 +17,8 @@ from recon.core.values.board import CalibrationBoard
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.figures import CalibrationFigures, DepthErrorCm, WorkingError
+from recon.rig.calibrate.lenses import LensChoice
 from recon.rig.calibrate.stereo import (
-    LensChoice,
     Spread,
     StereoFit,
     distances_m,

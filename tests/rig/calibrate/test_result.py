@@ -10,10 +10,9 @@ from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.figures import WorkingError
+from recon.rig.calibrate.lenses import LensChoice, compare_lenses
 from recon.rig.calibrate.stereo import (
-    LensChoice,
     calibrate_stereo,
-    compare_lenses,
     measure_spread,
 )
 from recon.rig.calibrate.verdict import (
