@@ -16,8 +16,10 @@ from recon.core.errors import SettingsError
 from recon.core.text import is_count
 
 _BOARD = (
-    "chess:9x6:25mm (inner corners, square size) or charuco:8x6:30mm:22mm:5x5_100 (squares, "
-    "square size, marker size, dictionary)."
+    "chess:9x6:25mm (inner corners, square size), charuco:8x6:30mm:22mm:5x5_100 (squares, square "
+    "size, marker size, dictionary), aprilgrid:6x6:88mm:0.3 (tags, tag size, gap relative to it), "
+    "circles:7x6:20mm:10mm or acircles:4x11:20mm:16mm (circles, step, diameter), or a "
+    "target.yaml of kalibr."
 )
 
 
@@ -73,12 +75,13 @@ def calibrate(
       recon calibrate "left*.png" "right*.png" --board chess:9x6:25mm -o rig.yaml
       recon calibrate left/ right/ --board charuco:8x6:30mm:22mm:5x5_100
       recon calibrate both.mp4 --board chess:9x6:25mm
+      recon calibrate left/ right/ --board april_6x6.yaml --model fisheye
     """
     with shared.one_line_errors():
         from recon.commands.cameras import run_calibrate
         from recon.commands.config import load_config
-        from recon.core.values.board import parse_board
         from recon.io.atomic import check_targets
+        from recon.io.cameras.targets import read_board
         from recon.rig.written import form_of, targets_of
 
         if out is not None:
@@ -90,7 +93,7 @@ def calibrate(
         run = run_calibrate(
             left,
             right,
-            parse_board(board),
+            read_board(board),
             settings,
             file=out,
             form=form,
@@ -128,15 +131,16 @@ def board(
     Examples:
       recon board chess:9x6:25mm --out board.pdf --paper a4
       recon board charuco:8x6:30mm:22mm:5x5_100 --out charuco.png
+      recon board aprilgrid:6x6:30mm:0.3 --out april.pdf
     """
     wanted = pattern or same
     if wanted is None or (pattern and same):
         raise typer.BadParameter("name one board, such as chess:9x6:25mm")
     with one_line_errors(quiet=quiet):
-        from recon.core.values.board import parse_board
+        from recon.io.cameras.targets import read_board
         from recon.rig.board_sheet import write_board
 
-        drawn = write_board(out, parse_board(wanted), paper, dpi)
+        drawn = write_board(out, read_board(wanted), paper, dpi)
     print_summary(drawn, as_json=json)
 
 
@@ -267,6 +271,9 @@ def capture(
     rate: Annotated[
         float | None, opt.setting("capture.rate_hz", "Requested frame rate, in frames per second.")
     ] = None,
+    board: Annotated[
+        str | None, opt.option("Say which views of this board are missing, see recon board.")
+    ] = None,
     preview: Annotated[int | None, opt.option("Update preview.jpg every N pairs.", min=1)] = None,
     *,
     shared: opt.Asked,
@@ -278,10 +285,12 @@ def capture(
 
     Examples:
       recon capture 0 2 --out rides/today --calib stereo.yaml --size 1280x720
+      recon capture 0 2 --out views --board chess:9x6:25mm
       recon capture /dev/video4 --out rides/today --set capture.suffix=jpg
     """
     with shared.one_line_errors():
         from recon.commands.cameras import run_capture
+        from recon.io.cameras.targets import read_board
         from recon.rig.capture import RecordingSettings
 
         known = shared.settings()
@@ -290,5 +299,8 @@ def capture(
         settings = RecordingSettings.parse({**dict(known.capture), **views, **limits})
         devices = [left] if right is None else [left, right]
         with until_interrupted() as stopped:
-            summary = run_capture(devices, out, settings, calibration=calib, stopped=stopped)
+            shown = None if board is None else read_board(board)
+            summary = run_capture(
+                devices, out, settings, calibration=calib, board=shown, stopped=stopped
+            )
     print_summary(summary, as_json=shared.json)

@@ -22,6 +22,8 @@ from recon.report.audit_page import write_audit_page
 from recon.report.calibration_page import write_calibration_page, write_epipolar_images
 from recon.rig.audit import Audit, audit_source, correct_calibration
 from recon.rig.calibrate.board_views import find_views, is_video, pick_views
+from recon.rig.calibrate.guide import BoardGuide, guided
+from recon.rig.calibrate.lenses import compare_lenses
 from recon.rig.calibrate.stereo import calibrate_stereo, measure_spread
 from recon.rig.calibrate.verdict import (
     CalibrationResult,
@@ -89,10 +91,13 @@ def run_calibrate(
         with run.stage("find"):
             seen = find_views(images, board, run.threads)
         with run.stage("solve"), serial_algebra():
-            fit = calibrate_stereo(seen.views, seen.size_px, config.calibration)
+            circle_m = board.marker_m if board.kind in ("circles", "acircles") else 0.0
+            fit = calibrate_stereo(seen.views, seen.size_px, config.calibration, circle_m)
         with run.stage("bootstrap"), serial_algebra():
             spread = measure_spread(fit, config.calibration)
-        result = describe_calibration(seen, fit, spread, config, images)
+        with run.stage("compare"), serial_algebra():
+            lenses = compare_lenses(fit, seen.size_px, config.calibration)
+        result = describe_calibration(seen, fit, spread, config, images, lenses)
         write_calibration(run.path("calibration.yaml"), result, "recon")
         summary = result.summary
         if file is not None:
@@ -176,18 +181,20 @@ def run_capture(
     settings: RecordingSettings,
     *,
     calibration: Path | None = None,
+    board: CalibrationBoard | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> CaptureSummary:
     """Record until stopped; with a calibration, the folder can be mapped as it is.
 
     ``devices`` are left and right camera, or one with both views: numbers, paths or video files.
     The folder must be new or empty; its ``capture.json`` gets the figures that are returned.
-    ``stopped`` is called before each pair.
+    ``stopped`` is called before each pair. With a ``board``, it says while recording which views
+    are missing.
     """
     if calibration is not None and not calibration.is_file():
         raise FormatError("file does not exist", where=calibration)
     with open_cameras(devices, settings) as cameras:
-        return record(cameras, folder, settings, calibration, stopped)
+        return record(cameras, folder, settings, calibration, stopped, board)
 
 
 def record(
@@ -196,8 +203,10 @@ def record(
     settings: RecordingSettings,
     calibration: Path | None,
     stopped: Callable[[], bool],
+    board: CalibrationBoard | None = None,
 ) -> CaptureSummary:
     """Record from opened cameras; see `run_capture`."""
+    guide = None if board is None else BoardGuide(board)
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     with CaptureFolder(folder, settings.suffix) as target:
         if calibration is not None:
@@ -206,6 +215,7 @@ def record(
         try:
             pairs = capture_pairs(cameras, settings, stopped)
             shown = tracked(pairs, "pairs", "record", total=settings.frames)
+            shown = shown if guide is None else guided(shown, guide)
             write_pairs(shown, target, settings.preview_every)
         finally:
             summary = CaptureSummary(
@@ -214,6 +224,7 @@ def record(
                 exposure_locked=locked,
                 figures=target.figures,
                 calibration=calibration is not None,
+                board=None if guide is None else guide.advice(),
                 out=str(folder),
             )
             if target.frames:  # else it has no summary

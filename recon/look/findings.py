@@ -39,6 +39,9 @@ _FROZEN_FRAMES: Final = 3  # repeats in a row from which one camera counts as fr
 _NEAR_RATIO: Final = 0.02  # fraction of features beyond the disparity range that is accepted
 _FAR_PX: Final = 1.5  # a scene with a smaller median disparity is too far for the baseline
 _MAX_SPEED_M_PER_S: Final = 70.0  # a higher apparent speed means that the baseline is wrong
+# Faint texture differs by a tenth of its brightness; matching needs it at twice the noise of a dark
+# image, which is about one grey level, and that of the rounding.
+_DARK_DN: Final = 2.0 * (1.0 + 12**-0.5) / 0.1
 _TEXTS: Final = {
     "unreadable": "{error}",
     "size error": "{error}",
@@ -46,6 +49,8 @@ _TEXTS: Final = {
     "255; check its cable, its lens cap and its exposure (16-bit images must fill their range)",
     "mosaic": "images of the {side} camera are a Bayer mosaic: colours are to be made of it; in a "
     "bag the encoding is to say so (bayer_rggb8 …), else record them demosaiced",
+    "dark": "images of the {side} camera are dark: mean grey level {mean:.0f} of 255, where faint "
+    "texture is lost in noise; more light, a longer exposure (at low speed), or more gain",
     "gain": "the right camera is {gain:.2f} times as bright as the left one; give both the same "
     "fixed exposure and gain{other}",
     "blur": "the {side} camera is blurred: sharpness {worse:.2f}, the other {better:.2f}; focus it "
@@ -135,6 +140,11 @@ def _of_images(sample: Sample, matcher: str | Matcher) -> Found:
     for name in _SIDES if pairs else ():
         if np.median([measure_mosaic(getattr(pair, name)) for pair in pairs]) > _MOSAIC:
             yield "mosaic", {"side": name}
+    means = np.median([one.brightness_dn for one in sample.pairs] or [(255.0, 255.0)], axis=0)
+    dark = [n for n in range(2) if means[n] < _DARK_DN and n not in _blank_sides(sample)]
+    if dark:
+        both = " and ".join(_SIDES[side] for side in dark)
+        yield "dark", {"side": both, "mean": means[dark].min()}
     if sample.sharpness is not None:
         left, right = sample.sharpness
         worse, better = min(left, right), max(left, right)

@@ -19,7 +19,7 @@ from recon.core.summary import Rows, Summary, optional
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
 from recon.io.atomic import write_bytes
-from recon.rig.calibrate.detect import dark_rectangles
+from recon.rig.calibrate.patterns import dark_polygons
 
 _PAPERS_MM: Final = {
     "a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "a1": (594.0, 841.0),
@@ -55,7 +55,8 @@ class BoardSummary(Summary):
     """A board that was drawn on a sheet."""
 
     board: str
-    square_mm: float
+    square_mm: float  # or the step between tags, or circles
+    measured: str  # what to measure on the print
     pattern_width_mm: float
     pattern_height_mm: float
     paper: str
@@ -69,7 +70,7 @@ class BoardSummary(Summary):
         sheet = f"{self.paper_width_mm:g} × {self.paper_height_mm:g} mm"
         dpi = "" if self.dpi is None else f", {self.dpi:.1f} dpi"
         return [
-            (f"board {self.board}, {size}, squares of {self.square_mm:g} mm",),
+            (f"board {self.board}, {size}, {self.measured}",),
             ("file", self.file, f"{self.paper}, {sheet}{dpi}"),
             ("print", "at 100 %, and check the ruler on it"),
             ("next", f"recon calibrate LEFT RIGHT --board {self.board}"),
@@ -114,6 +115,7 @@ def write_board(
     return BoardSummary(
         board=str(board),
         square_mm=1e3 * board.square_m,
+        measured=f"{board.measured[0]} of {1e3 * board.measured[1]:g} mm",
         pattern_width_mm=width_mm,
         pattern_height_mm=height_mm,
         paper=sheet.name,
@@ -131,13 +133,14 @@ def choose_sheet(board: CalibrationBoard, paper: str | None = None) -> Sheet:
     fitting = [sheet for sheet in sheets if _scale_to_fit(board, sheet) >= 1]
     if fitting:
         return fitting[0]
-    largest_mm = 1e3 * board.square_m * _scale_to_fit(board, sheets[-1])
+    said, given_m = board.measured
+    largest_mm = 1e3 * given_m * _scale_to_fit(board, sheets[-1])
     width_mm, height_mm = (1e3 * length for length in board.size_m)
     raise SettingsError(
         f"the board does not fit on {sheets[-1].name}",
         got=f"{width_mm:g} x {height_mm:g} mm without margin",
-        expected=f"squares of at most {np.floor(10 * largest_mm) / 10:g} mm there",
-        hint="a larger --paper (a3, a2, 600x400mm), or smaller squares",
+        expected=f"{said} of at most {np.floor(10 * largest_mm) / 10:g} mm there",
+        hint=f"a larger --paper (a3, a2, 600x400mm), or smaller {said}",
     )
 
 
@@ -156,7 +159,8 @@ def _turned(name: str, board: CalibrationBoard) -> Sheet:
 
 def _scale_to_fit(board: CalibrationBoard, sheet: Sheet) -> float:
     """Return the factor by which the squares could grow (above 1) or must shrink on a sheet."""
-    paper_mm, squares = np.array([sheet.width_mm, sheet.height_mm]), np.array(board.squares)
+    paper_mm = np.array([sheet.width_mm, sheet.height_mm])
+    squares = np.array(board.size_m) / board.square_m
     narrow, wide = paper_mm / (squares + 2 * _MARGIN_SQUARES), paper_mm - 2 * _SMALLEST_MARGIN_MM
     return float(min(*narrow, *(wide / squares)) / (1e3 * board.square_m))
 
@@ -172,9 +176,8 @@ def _draw(board: CalibrationBoard, sheet: Sheet, kind: str, dpi: float) -> bytes
     if kind == "png":  # align squares with pixels
         pixel_mm = _MM_PER_IN / dpi
         left_mm, top_mm = (round(mm / pixel_mm) * pixel_mm for mm in (left_mm, top_mm))
-    # The first inner corner is one square inside the corner of the pattern.
-    first_mm = np.array([left_mm, top_mm]) + 1e3 * board.square_m
-    dark_mm = 1e3 * dark_rectangles(board) + np.tile(first_mm, 2)
+    first_m = board.margin_m - board.corners_m[:, :2].min(axis=0)
+    dark_mm = 1e3 * (dark_polygons(board) + first_m) + (left_mm, top_mm)
     axes.add_patch(PathPatch(_outline(dark_mm), facecolor="black", linewidth=0))
     _note(axes, board, sheet, top_mm)
     buffer = io.BytesIO()
@@ -184,12 +187,12 @@ def _draw(board: CalibrationBoard, sheet: Sheet, kind: str, dpi: float) -> bytes
     return buffer.getvalue()
 
 
-def _outline(boxes_mm: Float64) -> Outline:
-    """Return all boxes (N, 4) as one path, so that neighbours are filled without a seam."""
-    x0, y0, x1, y1 = boxes_mm.T
-    corners = np.stack([x0, y0, x1, y0, x1, y1, x0, y1, x0, y0], axis=1).reshape(-1, 2)
-    one = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY]
-    return Outline(corners, one * len(boxes_mm))
+def _outline(polygons_mm: Float64) -> Outline:
+    """Return all polygons (M, K, 2) as one path, so that neighbours are filled without a seam."""
+    count, sides = polygons_mm.shape[:2]
+    closed = np.concatenate([polygons_mm, polygons_mm[:, :1]], axis=1)
+    one = [Outline.MOVETO, *[Outline.LINETO] * (sides - 1), Outline.CLOSEPOLY]
+    return Outline(closed.reshape(-1, 2), one * count)
 
 
 def _note(axes: Axes, board: CalibrationBoard, sheet: Sheet, margin_mm: float) -> None:

@@ -23,7 +23,7 @@ from typing_extensions import Self
 
 from recon.core.errors import OutputError, ReconError, SettingsError, SourceError
 from recon.core.settings import Settings
-from recon.core.summary import Figures, Rows, Summary, inline, shown_path
+from recon.core.summary import Figures, Rows, Summary, inline, optional, shown_path
 from recon.core.text import counted, is_count
 from recon.core.values import Rig, StereoPair
 from recon.core.values.arrays import UInt8, size_text
@@ -183,6 +183,7 @@ class CaptureSummary(Summary):
     exposure_locked: bool
     figures: CaptureFigures = inline()
     calibration: bool  # whether it lies in the folder
+    board: str | None = optional()  # what the views of a board lack
     out: str
 
     def rows(self) -> Rows:
@@ -199,6 +200,7 @@ class CaptureSummary(Summary):
             (f"{counted(seen.frames, 'pair')} in {seen.seconds:.1f} s{rate}",),
             ("folder", self.out),
             *([("time", apart)] if apart else []),
+            *([("board", self.board)] if self.board else []),
             ("next", f"recon audit {shown_path(self.out)}{calibrated}"),
         ]
 

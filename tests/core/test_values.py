@@ -291,14 +291,23 @@ def test_a_board_is_read_from_text(text, board):
 
 @pytest.mark.parametrize(
     "text",
-    ["chess:9x6:25mm", "charuco:8x6:30mm:22mm:4x4_50", "charuco:8x6:30mm:22mm:4x4_50:legacy"],
+    [
+        "chess:9x6:25mm",
+        "charuco:8x6:30mm:22mm:4x4_50",
+        "charuco:8x6:30mm:22mm:4x4_50:legacy",
+        "aprilgrid:6x6:88mm:0.3",
+        "aprilgrid:6x6:88mm:0.3:thin",
+        "circles:7x6:20mm:10mm",
+        "acircles:4x11:20mm:16mm",
+    ],
 )
 def test_a_board_tells_itself_as_it_is_read(text):
     assert str(parse_board(text)) == text
 
 
 NO_BOARDS = (
-    "9x6", "chess", "chess:9", "chess:9x6:25kg", "chess:9x6:25mm:3mm", "circles:4x5:3mm", "",
+    "9x6", "chess", "chess:9", "chess:9x6:25kg", "chess:9x6:25mm:3mm", "",
+    "circles:4x5:3mm:2mm:1mm",    "aprilgrid:6x6:88mm:0.3:legacy", "aprilgrid:6x6:88mm:wide",
     "charuco:8x6:30mm:22mm:4x4_50:older",
 )  # fmt: skip
 
@@ -311,6 +320,7 @@ NO_BOARDS = (
         ("chess:9x1:25mm", "too few inner corners"),
         ("charuco:8x6:30mm:30mm", "markers must be smaller"),
         ("chess:9x6:0mm", "implausible"),
+        ("circles:9x6:20mm:20mm", "circles than the step"),
     ],
 )
 def test_what_is_no_board_or_cannot_be_one_is_refused(text, message):

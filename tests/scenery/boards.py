@@ -12,12 +12,14 @@ from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.core.values import CameraIntrinsics, LensModel, StereoCalibration
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.board import CalibrationBoard
-from recon.rig.calibrate.detect import dark_rectangles
+from recon.rig.calibrate.patterns import dark_polygons
 from recon.stereo.rectify.lens import project_raw, rays_of
 
 Lens = Literal["radtan", "rational", "fisheye"]
 
-_TEXELS: Final = 48  # per square; corners lie on the borders between texels
+# Per square or step; corners lie on the borders between texels, and the cells of tags with gaps of
+# 0.3 do. Borders of circles are staircases.
+_TEXELS: Final = {"chess": 48, "charuco": 48, "aprilgrid": 52, "circles": 192, "acircles": 192}
 _WHITE, _DARK, _WALL = 225.0, 28.0, 120.0
 _MARGIN_PX: Final = 6.0
 _OFFSETS: Final = (np.arange(4) + 0.5) / 4 - 0.5  # of rays in a pixel
@@ -79,7 +81,8 @@ class BoardRenderer:
         # Rays vary smoothly, so linear interpolation within a pixel has no visible error.
         self._by_v = np.asarray(np.gradient(self._rays, axis=0))
         self._by_u = np.asarray(np.gradient(self._rays, axis=1))
-        self._texture = _texture(board)
+        self._texture, self._low = _texture(board)
+        self._texels = _TEXELS[board.kind]
 
     def render(self, T_camera_board: Float64, sigma_grey: float = 0.0, seed: int = 0) -> UInt8:
         """uint8 (H, W), the board at a pose in front of a grey wall, with noise of that sigma."""
@@ -111,8 +114,8 @@ class BoardRenderer:
             w = rays @ H[2, :2] + H[2, 2]
             x = (rays @ H[0, :2] + H[0, 2]) / w / self._board.square_m
             y = (rays @ H[1, :2] + H[1, 2]) / w / self._board.square_m
-            # The paper begins two squares before the first inner corner.
-            column, row = np.floor((x + 2) * _TEXELS), np.floor((y + 2) * _TEXELS)
+            column = np.floor((x - self._low[0]) * self._texels)
+            row = np.floor((y - self._low[1]) * self._texels)
         rows, columns = self._texture.shape
         hit = (w > 0) & (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
         picked = np.where(hit, row * columns + column, 0).astype(np.int64)
@@ -133,13 +136,26 @@ def render_views(
     ]
 
 
-def _texture(board: CalibrationBoard) -> Float64:
-    columns, rows = board.squares
-    texture = np.full(((rows + 2) * _TEXELS, (columns + 2) * _TEXELS), _WHITE)
-    texels = np.rint((dark_rectangles(board) / board.square_m + 2) * _TEXELS).astype(int)
-    for x0, y0, x1, y1 in texels:
-        texture[y0:y1, x0:x1] = _DARK
-    return texture
+def _texture(board: CalibrationBoard) -> tuple[Float64, Float64]:
+    """Grey levels of the paper, and where its upper left corner is; two squares are its margin."""
+    outlines = dark_polygons(board) / board.square_m
+    low = np.floor(outlines.min(axis=(0, 1))) - 1.0
+    columns, rows = np.ceil(outlines.max(axis=(0, 1)) - low).astype(int) + 1
+    texels = _TEXELS[board.kind]
+    texture = np.full((rows * texels, columns * texels), _WHITE)
+    for outline in (outlines - low) * texels:
+        (x0, y0), (x1, y1) = (
+            np.rint(outline.min(axis=0)).astype(int),
+            np.rint(outline.max(axis=0)).astype(int),
+        )
+        part = texture[y0:y1, x0:x1]
+        if len(outline) == 4:
+            part[:] = _DARK
+        else:
+            y, x = np.mgrid[y0:y1, x0:x1] + 0.5
+            cx, cy = outline.mean(axis=0)
+            part[np.hypot(x - cx, y - cy) < np.ptp(outline[:, 0]) / 2] = _DARK
+    return texture, low
 
 
 def _try_place(
@@ -177,10 +193,13 @@ def _facing(ray: Float64) -> Float64:
 
 def _outline(board: CalibrationBoard, margin: float = 0.0) -> Float64:
     """float64 (N, 3), outline of the pattern or its paper, in steps of a quarter square."""
+    outlines = dark_polygons(board)
+    (x0, y0), (x1, y1) = outlines.min(axis=(0, 1)), outlines.max(axis=(0, 1))
+    more = margin * board.square_m
     columns, rows = board.squares
-    x = np.linspace(-1 - margin, columns - 1 + margin, 4 * columns + 1)
-    y = np.linspace(-1 - margin, rows - 1 + margin, 4 * rows + 1)
+    x = np.linspace(x0 - more, x1 + more, 4 * columns + 1)
+    y = np.linspace(y0 - more, y1 + more, 4 * rows + 1)
     level = [np.stack([x, np.full_like(x, end)], axis=1) for end in (y[0], y[-1])]
     upright = [np.stack([np.full_like(y, end), y], axis=1) for end in (x[0], x[-1])]
-    flat = np.concatenate([*level, *upright]) * board.square_m
+    flat = np.concatenate([*level, *upright])
     return np.hstack([flat, np.zeros((len(flat), 1))])

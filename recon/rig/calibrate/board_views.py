@@ -21,10 +21,10 @@ from recon.rig.calibrate.bundle import Sighting, View
 from recon.rig.calibrate.detect import (
     check_charuco,
     check_chessboard,
-    find_board,
     grown_size,
     orient_like,
 )
+from recon.rig.calibrate.patterns import find_board
 from recon.sources.images import ImagePairs
 from recon.sources.settings import SourceSettings
 from recon.sources.video import VIDEOS, VideoFile, open_videos, split_views, view_size
@@ -49,7 +49,7 @@ class BoardViews:
     empty: tuple[Path, ...]  # files in which the board is not found
     size_px: tuple[int, int]  # (width, height) of every image
     count: int  # number of image pairs
-    board: CalibrationBoard  # as detected; its ``legacy`` pattern may differ from that given
+    board: CalibrationBoard  # as detected; its ``legacy`` layout may differ from that given
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> Boa
             raise SourceError(what, where=path, got=got, expected=expected, hint=hint)
     if board.kind == "chess":
         check_chessboard([look.grown for look in looks], lambda n: _read_grey(files[n]), board)
-    elif not any(look.seen for look in looks):
+    elif board.kind == "charuco" and not any(look.seen for look in looks):
         check_charuco(len(files), lambda n: _read_grey(files[n]), board)
     if not any(look.seen for look in looks):
         raise CalibrationError(
@@ -88,7 +88,7 @@ def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> Boa
     views, pairs = {}, {}
     for pair, first, second in zip(images.pairs, looks[::2], looks[1::2], strict=True):
         if (left := first.seen) is not None and (right := second.seen) is not None:
-            if board.kind == "chess":  # its corners have no ids
+            if not board.numbered:
                 pixels = orient_like(left.pixels, right.pixels, board.inner)
                 right = replace(right, pixels=pixels)
             views[pair[0].name], pairs[pair[0].name] = View(pair[0].name, (left, right)), pair
@@ -98,15 +98,15 @@ def find_views(images: ImagePairs, board: CalibrationBoard, threads: int) -> Boa
 def _look_at_all(
     files: Sequence[Path], board: CalibrationBoard, threads: int
 ) -> tuple[CalibrationBoard, list[_Look]]:
-    """Return detections in all images, and the board, which may have the legacy pattern."""
+    """Return detections in all images, and the board, which may have the other layout."""
     with ThreadPoolExecutor(threads) as pool:
         seen = pool.map(lambda path: _look(path, board), files)
         looks = list(tracked(seen, "images", "find the board", total=len(files)))
-        if board.kind == "chess" or any(look.seen for look in looks):
+        if not board.dictionary or any(look.seen for look in looks):
             return board, looks
         other = replace(board, legacy=not board.legacy)
         seen = pool.map(lambda path: _look(path, other), files)
-        older = list(tracked(seen, "images", "find the older board", total=len(files)))
+        older = list(tracked(seen, "images", "find its other layout", total=len(files)))
         return (other, older) if any(look.seen for look in older) else (board, looks)
 
 

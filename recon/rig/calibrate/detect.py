@@ -1,65 +1,35 @@
-"""A calibration board in one image: its corners to subpixel accuracy; and its size."""
+"""Whether the board in the images is the one that was stated, and how it lies in a second one."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from itertools import product
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
 
-from recon.core.errors import CalibrationError, SettingsError
+from recon.core.errors import CalibrationError
 from recon.core.text import counted
 from recon.core.values.arrays import Float64, Int32, UInt8
 from recon.core.values.board import CalibrationBoard
-from recon.rig.calibrate.bundle import Sighting
+from recon.rig.calibrate.patterns import (
+    SLOW_FLAGS,
+    WINDOW,
+    Inner,
+    dictionaries,
+    dictionary,
+    find_chessboard,
+    refine_corners,
+)
 
-Inner = tuple[int, int]
-_SEARCH_WIDTH_PX: Final = 1280  # corners are refined at full resolution
-# Half the window of the subpixel search, relative to the corner spacing: as wide as possible
-# without another corner in it.
-_WINDOW: Final = 0.33
-_SMALLEST_WINDOW_PX: Final = 2
-_LARGEST_WINDOW_PX: Final = 25
-_SUB_PIXEL: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-5)
-_CHESS_FLAGS: Final = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
-_SLOW_FLAGS: Final = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
-_FEWEST_CORNERS: Final = 8
-_LOST: Final = 0.5  # corners that refinement moves farther, relative to the spacing, stay
 _CORNER_CONTRAST: Final = 0.5  # least contrast of quadrants at a corner, relative to the median
 _LARGEST: Final = 60
 _SURE: Final = 3  # images that must agree on a size, or markers per image, to rule out chance
 _PROBED: Final = 8  # images in which any board is searched if few show the given one
 _PROBED_MARKERS: Final = 2  # fewer for markers: all of OpenCV's twenty dictionaries are tried
-_PREFIX: Final = "DICT_"
-
-
-def find_board(grey: UInt8, board: CalibrationBoard) -> Sighting | None:
-    """Find the corners of a board, or a part of ChArUco; None if fewer than 8, or on one line."""
-    if board.kind == "charuco":
-        corners, found_numbers, *_ = cv2.aruco.CharucoDetector(_charuco(board)).detectBoard(grey)
-        if found_numbers is None:
-            return None
-        numbers = np.asarray(found_numbers, dtype=np.int32).ravel()
-        pixels = np.asarray(corners, dtype=np.float64).reshape(-1, 2)
-    else:
-        found = _find_chessboard(grey, board.inner)
-        pixels = np.zeros((0, 2)) if found is None else found
-        numbers = np.arange(len(pixels), dtype=np.int32)
-    if len(numbers) < min(_FEWEST_CORNERS, len(board.corners_m)):
-        return None
-    flat = board.corners_m[numbers, :2]
-    if np.linalg.matrix_rank(flat - flat.mean(axis=0), tol=1e-9 * board.square_m) < 2:
-        return None
-    # The edges of the markers must stay outside the window.
-    free = (board.square_m - board.marker_m) / (2 * board.square_m)
-    window = min(_WINDOW, 0.8 * free)
-    pixels = _refine_corners(grey, pixels, _spacing(numbers, pixels, board), window)
-    return Sighting(numbers, board.corners_m[numbers], pixels)
 
 
 def orient_like(reference: Float64, pixels: Float64, inner: Inner) -> Float64:
@@ -79,46 +49,6 @@ def orient_like(reference: Float64, pixels: Float64, inner: Inner) -> Float64:
 def _shape(pixels: Float64) -> Float64:
     centred = pixels - pixels.mean(axis=0)
     return np.asarray(centred / np.linalg.norm(centred))
-
-
-def _find_chessboard(grey: UInt8, inner: Inner) -> Float64 | None:
-    """Return float64 (N, 2), approximate inner corners row by row, or None."""
-    scale = min(1.0, _SEARCH_WIDTH_PX / grey.shape[1])
-    small = grey
-    if scale != 1:
-        small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    found, corners = cv2.findChessboardCorners(small, inner, flags=_CHESS_FLAGS)
-    if not found:
-        # Slower and stricter about margins, but finds tilted and badly lit boards.
-        found, corners = cv2.findChessboardCornersSB(small, inner, flags=_SLOW_FLAGS)
-    if not found:
-        return None
-    return np.asarray((np.asarray(corners, np.float64).reshape(-1, 2) + 0.5) / scale - 0.5)
-
-
-def _refine_corners(
-    grey: UInt8, pixels: Float64, spacing_px: float, window: float = _WINDOW
-) -> Float64:
-    """Return corners (N, 2) refined in a window, whose half width is relative to the spacing."""
-    half = int(np.clip(round(window * spacing_px), _SMALLEST_WINDOW_PX, _LARGEST_WINDOW_PX))
-    start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    refined = cv2.cornerSubPix(grey, start.copy(), (half, half), (-1, -1), _SUB_PIXEL)
-    lost = np.linalg.norm(refined - start, axis=2) > _LOST * spacing_px
-    return np.where(lost[..., None], start, refined).reshape(-1, 2).astype(np.float64)
-
-
-def _spacing(numbers: Int32, pixels: Float64, board: CalibrationBoard) -> float:
-    """Return the smallest distance between neighbouring corners of the board, pixels."""
-    columns = board.inner[0]
-    place = np.full(len(board.corners_m) + columns, -1)
-    place[numbers] = np.arange(len(numbers))
-    across = [(n, n + 1) for n in numbers if (n + 1) % columns]
-    down = [(n, n + columns) for n in numbers]
-    pairs = [(place[a], place[b]) for a, b in [*across, *down] if place[a] >= 0 and place[b] >= 0]
-    if not pairs:
-        return 3.0 * _SMALLEST_WINDOW_PX
-    first, second = np.array(pairs).T
-    return float(np.linalg.norm(pixels[first] - pixels[second], axis=1).min())
 
 
 def check_chessboard(
@@ -218,7 +148,7 @@ def grown_size(grey: UInt8, pixels: Float64, inner: Inner) -> Inner:
 
 
 def _probe_size(grey: UInt8) -> Inner | None:
-    flags = cv2.CALIB_CB_LARGER | _SLOW_FLAGS
+    flags = cv2.CALIB_CB_LARGER | SLOW_FLAGS
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
     if not found or meta is None:
         return None
@@ -228,7 +158,7 @@ def _probe_size(grey: UInt8) -> Inner | None:
         return None
     size = grown_size(grey, pixels, (columns, rows))
     # Detecting the whole extended board again rejects mere textures of squares.
-    return size if _find_chessboard(grey, size) is not None else None
+    return size if find_chessboard(grey, size) is not None else None
 
 
 def _spread(numbers: Sequence[int], count: int) -> list[int]:
@@ -253,7 +183,9 @@ def _continue(grey: UInt8, grid: Float64, axis: int, usual: float) -> Float64 | 
     height, width = grey.shape
     if step < 4 or (guess < 2).any() or (guess > (width - 3, height - 3)).any():
         return None
-    longer = np.concatenate([lines, _refine_corners(grey, guess, step)[None]])
+    longer = np.concatenate(
+        [lines, refine_corners(grey, guess, np.full(len(guess), WINDOW * step))[None]]
+    )
     longer = np.moveaxis(longer, 0, axis)
     added = np.moveaxis(_contrast(grey, longer), axis, 0)[-1]
     if np.isnan(added).all() or not np.nanmedian(added) > _CORNER_CONTRAST * usual:
@@ -278,62 +210,12 @@ def _sample(grey: UInt8, places: Float64) -> Float64:
     return np.where(inside, grey[y, x].astype(np.float64), np.nan)
 
 
-def dark_rectangles(board: CalibrationBoard) -> Float64:
-    """Return float64 (M, 4), dark rectangles: x0, y0, x1, y1, metres from the first corner."""
-    columns, rows = board.squares
-    # OpenCV's boards have a dark square at the upper left corner, legacy ones at the lower left.
-    light = 1 if board.kind == "charuco" and board.legacy and rows % 2 == 0 else 0
-    dark = [(x, y) for y in range(rows) for x in range(columns) if (x + y) % 2 == light]
-    low = np.array(dark, dtype=np.float64)
-    if board.kind == "chess":
-        return np.asarray(np.hstack([low - 1.0, low]) * board.square_m)
-    charuco, low = _charuco(board), low * board.square_m
-    cells = [np.hstack([low, low + board.square_m])]
-    dictionary = _dictionary(board.dictionary)
-    side = dictionary.markerSize + 2  # cells of a marker
-    for number, corners in zip(charuco.getIds().ravel(), charuco.getObjPoints(), strict=True):
-        bits = cv2.aruco.generateImageMarker(dictionary, int(number), side)
-        down, across = np.nonzero(bits == 0)
-        step = board.marker_m / side
-        first = np.asarray(corners)[:, :2].min(axis=0)
-        low = first + np.stack([across, down], axis=1) * step
-        cells.append(np.hstack([low, low + step]))
-    return np.asarray(np.concatenate(cells) - board.square_m)
-
-
-def _find_markers(grey: UInt8, dictionary: str) -> Int32:
-    numbers = cv2.aruco.ArucoDetector(_dictionary(dictionary)).detectMarkers(grey)[1]
+def _find_markers(grey: UInt8, name: str) -> Int32:
+    numbers = cv2.aruco.ArucoDetector(dictionary(name)).detectMarkers(grey)[1]
     return np.zeros(0, np.int32) if numbers is None else np.asarray(numbers, np.int32).ravel()
 
 
 def _marker_votes(images: Sequence[UInt8]) -> tuple[str, Counter[str]]:
     """Return the dictionary with the most markers found, and the number found of each."""
-    counts = {n: sum(len(_find_markers(image, n)) for image in images) for n in _dictionaries()}
+    counts = {n: sum(len(_find_markers(image, n)) for image in images) for n in dictionaries()}
     return max(counts, key=counts.__getitem__), Counter(counts)
-
-
-def _dictionaries() -> list[str]:
-    return sorted({n[len(_PREFIX) :].upper() for n in dir(cv2.aruco) if n.startswith(_PREFIX)})
-
-
-def _dictionary(name: str) -> Any:
-    number = getattr(cv2.aruco, f"{_PREFIX}{name}", None)
-    if number is None:
-        known = ", ".join(_dictionaries())
-        raise SettingsError("unknown marker dictionary", got=name, expected=known)
-    return cv2.aruco.getPredefinedDictionary(number)
-
-
-@lru_cache(maxsize=4)
-def _charuco(board: CalibrationBoard) -> Any:
-    dictionary = _dictionary(board.dictionary)
-    if len(dictionary.bytesList) < math.prod(board.squares) // 2:
-        raise SettingsError(
-            "dictionary has too few markers for the board",
-            got=f"{board.dictionary.lower()} with {len(dictionary.bytesList)}",
-            expected=f"at least {math.prod(board.squares) // 2}",
-        )
-    size = (board.columns, board.rows)
-    charuco = cv2.aruco.CharucoBoard(size, board.square_m, board.marker_m, dictionary)
-    charuco.setLegacyPattern(board.legacy)
-    return charuco

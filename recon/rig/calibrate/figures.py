@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from recon.core.summary import Figures
 
@@ -61,3 +61,6 @@ class CalibrationFigures(Figures):
     depth_error_cm: Mapping[str, DepthErrorCm]  # by distance in metres
     working_error: WorkingError
     rectified_focal_px: float
+    held_out_px: Mapping[str, float] = field(
+        default_factory=dict
+    )  # of views left out, by lens model

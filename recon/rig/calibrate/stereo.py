@@ -14,13 +14,14 @@ from typing import Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import apply, exp_so3, invert, log_so3, make_transform
 from recon.core.progress import tracked
 from recon.core.text import counted, round_lengths
 from recon.core.values import CameraIntrinsics, StereoCalibration
-from recon.core.values.arrays import Float64
+from recon.core.values.arrays import Bool, Float64
 from recon.rig.calibrate.bundle import (
     Information,
     RigState,
@@ -32,7 +33,7 @@ from recon.rig.calibrate.bundle import (
     squared_errors,
 )
 from recon.rig.settings import CalibrationSettings
-from recon.stereo.rectify.lens import project_into_image, rays_of
+from recon.stereo.rectify.lens import project_into_image, project_raw, rays_of
 
 Size = tuple[int, int]
 # Half fields of view that are tried for a fisheye lens.
@@ -66,8 +67,12 @@ class StereoFit:
     rms_px: float  # rms reprojection error over all corners of both cameras
 
 
-def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSettings) -> StereoFit:
+def calibrate_stereo(
+    views: Sequence[View], size: Size, settings: CalibrationSettings, circle_m: float = 0.0
+) -> StereoFit:
     """Calibrate two cameras: each alone, then all parameters of both together.
+
+    ``circle_m`` is the diameter of circles whose centroids are given; 0 = the views are corners.
 
     Ref: Zhang 2000; the lens models are OpenCV's.
     """
@@ -100,6 +105,9 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
     rms_px = math.sqrt(float(sums.sum() / counts.sum()))
     left_px, right_px = (math.sqrt(float((errors**2).mean())) for errors in alone)
     _check_fit(rms_px, (left_px, right_px))
+    if circle_m:
+        fit = calibrate_stereo(_centred(kept, state, circle_m), size, settings)
+        return replace(fit, repeated=repeated, dropped=dropped | fit.dropped)
     return StereoFit(
         calibration=stereo_of(state),
         state=state,
@@ -111,6 +119,28 @@ def calibrate_stereo(views: Sequence[View], size: Size, settings: CalibrationSet
         alone_px=(left_px, right_px),
         rms_px=rms_px,
     )
+
+
+def _centred(views: Sequence[View], state: RigState, circle_m: float) -> list[View]:
+    """Return views with the images of the centres of circles, which are not their centroids."""
+    turn = np.linspace(0.0, 2 * math.pi, 32, endpoint=False)
+    ring = circle_m / 2 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
+
+    def shifted(seen: Sighting, camera: CameraIntrinsics, T_camera_board: Float64) -> Sighting:
+        around = apply(T_camera_board, (seen.board_m[:, None] + ring).reshape(-1, 3))
+        u, v = project_raw(camera, around).reshape(-1, len(ring), 2).transpose(2, 0, 1)
+        nu, nv = (np.roll(each, -1, axis=1) for each in (u, v))
+        area = u * nv - nu * v  # twice that of each triangle with the origin
+        centroid = np.stack([((u + nu) * area).sum(axis=1), ((v + nv) * area).sum(axis=1)], axis=1)
+        middle = project_raw(camera, apply(T_camera_board, seen.board_m))
+        moved_px = middle - centroid / (3 * area.sum(axis=1)[:, None])
+        return replace(seen, pixels=seen.pixels + moved_px)
+
+    return [
+        replace(view, seen=tuple(map(shifted, view.seen, state.cameras, T @ T_rig_board)))
+        for T in [np.stack(state.T_camera_rig)]
+        for view, T_rig_board in zip(views, state.T_rig_board, strict=True)
+    ]
 
 
 def stereo_of(state: RigState) -> StereoCalibration:
@@ -276,12 +306,12 @@ def _view_errors(views: Sequence[View], state: RigState) -> Float64:
     return np.asarray(np.sqrt(sums.sum(axis=1) / counts.sum(axis=1)))
 
 
-_PLACES: Final = (0.2, 0.5, 0.8)  # depth errors are those of a 3 by 3 grid in the left image
-_MIDDLE: Final = 4
+CELLS: Final = (8, 6)  # image cells; without corners in one, the lens is extrapolated there
 _MATCHED: Final = 0.02  # relative error of matching at the default working distance
 MATCH_SIGMA_PX: Final = 0.25  # assumed matching error, by which depth errors are predicted
 _AROUND: Final = (0.2, 2.0)  # of the working distance: depths at which the error is predicted
 _RESAMPLES: Final = 500
+_ONE_SIGMA: Final = 0.6827  # of a normal distribution
 CONFIDENCE: Final = 0.95  # confidence level of the intervals
 
 
@@ -290,7 +320,8 @@ class DepthError:
     """Predicted depth error at one distance along the optical axis of the left camera."""
 
     depth_m: float  # the distance
-    calibration_m: float  # rms error over resamples and image; NaN = the views do not overlap
+    # standard error where corners were seen, rms over the image; NaN = the views do not overlap
+    calibration_m: float
     low_m: float  # interval of the error at the image centre; negative = measured too near
     high_m: float
     matching_m: float  # error due to matching, with `MATCH_SIGMA_PX`
@@ -349,6 +380,12 @@ def measure_spread(fit: StereoFit, settings: CalibrationSettings) -> Spread:
     )
 
 
+def expected_ratio(fit: StereoFit, settings: CalibrationSettings) -> float:
+    """Return the expected depth error at the working distance, relative to it; NaN = no overlap."""
+    depth_m = _working_distance(fit.calibration, settings)
+    return _depth_error(fit, _resample(fit), depth_m).calibration_m / depth_m
+
+
 def _working_distance(rig: StereoCalibration, settings: CalibrationSettings) -> float:
     """Return the distance at which depth matters: by default, where matching errs by 2 %."""
     usual_m = _MATCHED * float(rig.left.matrix[0, 0]) * rig.baseline_m / MATCH_SIGMA_PX
@@ -375,19 +412,49 @@ def _interval(values: list[float]) -> tuple[float, float]:
 
 def _depth_error(fit: StereoFit, rigs: list[StereoCalibration], depth_m: float) -> DepthError:
     rig = fit.calibration
-    width, height = rig.left.width_px, rig.left.height_px
-    places = np.array([[x * width, y * height] for y in _PLACES for x in _PLACES])
+    left_seen, right_seen = (seen_cells(fit, side) for side in (0, 1))
+    size = np.array([rig.left.width_px, rig.left.height_px])
+    middle_px = np.array([size / 2])
+    places = np.concatenate([middle_px, (np.argwhere(left_seen) + 0.5) / CELLS * size])
     xyz = rays_of(rig.left, places) * depth_m
     right_px = project_into_image(rig.right, apply(rig.T_right_left, xyz))
     shared = np.asarray(np.isfinite(right_px).all(axis=1))
     focal_px = float(rig.left.matrix[0, 0])
     matching_m = depth_m**2 * MATCH_SIGMA_PX / (focal_px * rig.baseline_m)
-    if not shared[_MIDDLE]:
+    if not shared[0]:
         return DepthError(depth_m, np.nan, np.nan, np.nan, matching_m)
-    seen = places[shared], right_px[shared]
-    errors = np.array([measure_depth(other, *seen) - depth_m for other in rigs])
-    middle = errors[:, int(shared[:_MIDDLE].sum())]
-    low_m, high_m = _interval(list(middle))
-    # NaN: the lens of a resample may not be invertible at the image border.
-    rms_m = float(np.sqrt(np.nanmean(errors**2)))
+    # Elsewhere the lens is extrapolated, of which the coverage tells.
+    shared[shared] = right_seen[cells_of(right_px[shared], rig.right)]
+    shared[0] = True
+    errors = np.array([measure_depth(r, places[shared], right_px[shared]) for r in rigs]) - depth_m
+    low_m, high_m = _interval(list(errors[:, 0]))
+    # The few resamples that determine a lens badly do not count for more than they are. NaN: the
+    # lens of one may not be invertible at the image border.
+    aside = (1 - _ONE_SIGMA) / 2
+    low, high = np.nanquantile(errors, (aside, 1 - aside), axis=0)
+    rms_m = float(np.sqrt(np.nanmean(((high - low) / 2) ** 2)))
     return DepthError(depth_m, rms_m, low_m, high_m, matching_m)
+
+
+def cells_of(pixels: Float64, camera: CameraIntrinsics) -> tuple[NDArray[np.intp], ...]:
+    """Return column and row (N,) of the cells of an image in which pixels (N, 2) are."""
+    size = np.array([camera.width_px, camera.height_px])
+    cells = np.floor((pixels + 0.5) / size * CELLS).astype(np.intp)
+    return tuple(np.clip(cells, 0, np.array(CELLS) - 1).T)
+
+
+def seen_cells(fit: StereoFit, side: int) -> Bool:
+    """Return bool `CELLS`: in which cells of an image a corner was seen."""
+    seen = np.zeros(CELLS, dtype=bool)
+    pixels = np.concatenate([view.seen[side].pixels for view in fit.views])
+    seen[cells_of(pixels, fit.state.cameras[side])] = True
+    return seen
+
+
+def distances_m(fit: StereoFit) -> Float64:
+    """Return float64 (V,), distance of the middle of the board from the left camera."""
+    middles = [
+        (T @ [*view.seen[0].board_m.mean(axis=0), 1.0])[:3]
+        for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
+    ]
+    return np.asarray(np.linalg.norm(middles, axis=1))

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import numpy as np
 
 from recon.core.summary import Rows, RunSummary, inline, optional, shown_path
 from recon.core.text import counted, metres
-from recon.core.values import CameraIntrinsics
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.figures import CalibrationFigures, DepthErrorCm, WorkingError
-from recon.rig.calibrate.stereo import Spread, StereoFit
+from recon.rig.calibrate.lenses import LensChoice
+from recon.rig.calibrate.stereo import (
+    Spread,
+    StereoFit,
+    distances_m,
+    seen_cells,
+)
 from recon.rig.settings import CalibratedSettings
 from recon.rig.written import CalibrationForm, write_rig
 from recon.sources.images import ImagePairs
@@ -37,10 +43,10 @@ _APART: Final = 2.0  # stereo error relative to that of each camera alone
 _ROWS_PX: Final = 1.0  # a block matcher loses most matches to a epipolar error of one pixel
 _USUAL_BASELINE_M: Final = (0.01, 2.0)
 # What a good set of views has, used to say what another one lacks.
-_ENOUGH_VIEWS: Final = 20
-_COVERED: Final = 0.8
-_TILTED: Final = 0.5
-_FAR_TO_NEAR: Final = 2.0
+ENOUGH_VIEWS: Final = 20
+COVERED: Final = 0.8
+TILTED: Final = 0.5
+FAR_TO_NEAR: Final = 2.0
 TILT_DEG: Final = 20.0  # a board turned away by this much determines the focal length
 _SHARP_PX: Final = 0.5
 _UNSURE_FOCAL: Final = 0.01  # half of the interval, relative to the focal length
@@ -49,13 +55,13 @@ _TEXTS: Final = {
     "overlap": "both cameras have no common view at {at}",
     "depth": "depth at {at} is expected to be wrong by {wrong} ({percent:.1f} %) because of the "
     f"calibration; up to {100 * _GOOD:.0f} % is good, up to {100 * _USABLE:.0f} % usable",
-    "views": f"only {{views}}: the expected error is unsure; take {_ENOUGH_VIEWS}",
+    "views": f"only {{views}}: the expected error is unsure; take {ENOUGH_VIEWS}",
     "coverage": "the board was seen in {percent:.0f} % of the {side} image: the lens is guessed "
     "elsewhere; show it in every corner",
     "together": "both cameras together fit worse than alone: not synchronised, or moved?",
     "rows": "the epipolar error is {epipolar_95_px:.2f} px after rectification (95 % of the "
     "corners are better): matching fails there; is the board flat, does --model suit?",
-    "baseline": "baseline is {baseline_m:.3g} m: are the squares really {square_mm:g} mm?",
+    "baseline": "baseline is {baseline_m:.3g} m: are the {said} really {given_mm:g} mm?",
     "square": "size of a square not given: every length is in squares; add it, as in :25mm",
     "order": "names do not say which images belong together: paired by their order",
     "unpaired": "images without a partner, left out: {count} ({names})",
@@ -64,7 +70,7 @@ _TEXTS: Final = {
     "repeats": "{views} with the board where another one has it, counted once; move and tilt it "
     "between two views",
     "corners": "bring the board closer to the corners: seen in {percent:.0f} % of the {side} "
-    f"image, {100 * _COVERED:.0f} % is good",
+    f"image, {100 * COVERED:.0f} % is good",
     "tilt": f"tilt the board more: by {TILT_DEG:.0f} degrees or more in "
     "{percent:.0f} % of the views, half of them is good",
     "focal": "focal length is unsure: {low:.1f} to {high:.1f} px; take more tilted views",
@@ -72,7 +78,11 @@ _TEXTS: Final = {
     "times as far as the nearest",
     "sharpness": "corners fit to {stereo_rms_px:.2f} px only: focus, light, a flat board, and hold "
     "it still",
-    "more": f"take more views: {{views_used}} different ones, {_ENOUGH_VIEWS} are good",
+    "model": "{best} fits the lens better: {lens.held_out_px:.2f} px in views that are left out, "
+    "against {own.held_out_px:.2f}{fewer}; --model {best}",
+    "lens": "no lens model fits views that are held out: {errors}; is the board flat and the image "
+    "sharp?",
+    "more": f"take more views: {{views_used}} different ones, {ENOUGH_VIEWS} are good",
 }
 _NOTHING_LACKS: Final = "the views lack nothing: take more of their kind"
 
@@ -95,7 +105,10 @@ def verdict_of_calibration(findings: Sequence[CalibrationFinding]) -> Verdict:
 
 
 def judge_calibration(
-    board: CalibrationBoard, images: ImagePairs, figures: CalibrationFigures
+    board: CalibrationBoard,
+    images: ImagePairs,
+    figures: CalibrationFigures,
+    lens: Sequence[tuple[str, dict[str, Any]]] = (),
 ) -> list[CalibrationFinding]:
     """Return all findings of a calibration, the gravest first."""
     known = figures.to_json()
@@ -111,10 +124,10 @@ def judge_calibration(
         "fatal" if ratio is None or ratio > _USABLE else "warning", _depth_faults(board, figures)
     )
     found += described("warning", _doubts(board, figures))
-    lacking: list[CalibrationFinding] = []
+    lacking = described("note", iter(lens))
     if verdict_of_calibration(found) != "good":
         nothing = CalibrationFinding("more", "note", _NOTHING_LACKS)
-        lacking = described("note", _lacks(figures)) or [nothing]
+        lacking = [*lacking, *described("note", _lacks(figures))] or [nothing]
     return [*found, *described("note", _left_out(board, images, figures)), *lacking]
 
 
@@ -141,7 +154,8 @@ def _doubts(board: CalibrationBoard, found: CalibrationFigures) -> Found:
         yield "rows", {}
     shortest, longest = _USUAL_BASELINE_M
     if board.metric and not shortest <= found.baseline_m <= longest:
-        yield "baseline", {"square_mm": 1e3 * board.square_m}
+        said, given_m = board.measured
+        yield "baseline", {"said": said, "given_mm": 1e3 * given_m}
 
 
 def _left_out(board: CalibrationBoard, images: ImagePairs, found: CalibrationFigures) -> Found:
@@ -163,19 +177,32 @@ def _left_out(board: CalibrationBoard, images: ImagePairs, found: CalibrationFig
 
 def _lacks(found: CalibrationFigures) -> Found:
     ratio, side = min((found.coverage_left, "left"), (found.coverage_right, "right"))
-    if _SMALL_COVERAGE <= ratio < _COVERED:
+    if _SMALL_COVERAGE <= ratio < COVERED:
         yield "corners", {"percent": 100 * ratio, "side": side}
-    if found.tilted_ratio < _TILTED:
+    if found.tilted_ratio < TILTED:
         yield "tilt", {"percent": 100 * found.tilted_ratio}
     low, high = found.focal_interval_px
     if high - low > 2 * _UNSURE_FOCAL * found.focal_px:
         yield "focal", {"low": low, "high": high}
-    if found.far_to_near < _FAR_TO_NEAR:
+    if found.far_to_near < FAR_TO_NEAR:
         yield "distances", {}
     if found.stereo_rms_px > _SHARP_PX:
         yield "sharpness", {}
-    if _FEW_VIEWS <= found.views_used < _ENOUGH_VIEWS:
+    if _FEW_VIEWS <= found.views_used < ENOUGH_VIEWS:
         yield "more", {}
+
+
+def lens_faults(lenses: Mapping[str, LensChoice], model: str) -> Found:
+    """Yield a model that suits the lens better, or that none does."""
+    own, suiting = lenses.get(model), [name for name, lens in lenses.items() if lens.suits]
+    best = min(suiting, key=lambda name: lenses[name].working_ratio, default=model)
+    if own is not None and best != model and (not own.suits or own.working_ratio > _GOOD):
+        fewer = own.coefficients - lenses[best].coefficients
+        text = f", with {fewer} fewer coefficients" if fewer > 0 else ""
+        yield "model", {"best": best, "lens": lenses[best], "own": own, "fewer": text}
+    if lenses and min(lens.held_out_px for lens in lenses.values()) > _SHARP_PX:
+        errors = ", ".join(f"{name} {lens.held_out_px:.2f} px" for name, lens in lenses.items())
+        yield "lens", {"errors": errors}
 
 
 def _length(metres: float, board: CalibrationBoard) -> str:
@@ -188,7 +215,6 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
-_CELLS: Final = (8, 6)  # image cells; without corners in one, the lens is extrapolated there
 _DEPTH_CM: Final = ("calibration", "low", "high", "matching")  # of each `DepthError`
 # Figures that are also written into the calibration file.
 _KEPT: Final = (
@@ -255,6 +281,7 @@ def describe_calibration(
     spread: Spread,
     config: CalibratedSettings,
     images: ImagePairs,
+    lenses: Mapping[str, LensChoice] = MappingProxyType({}),
 ) -> CalibrationResult:
     """Rectify the views with the calibrated rig, measure how well it describes them, and judge."""
     turns = plan_turns(fit.calibration, config.rectification)
@@ -264,7 +291,12 @@ def describe_calibration(
         rows.append(left[:, 1] - turns.place(fit.calibration, right_px, right=True)[:, 1])
     epipolar_error_px = np.concatenate(rows)
     figures = _figures(seen, fit, spread, epipolar_error_px, turns.camera.focal_px)
-    findings = judge_calibration(seen.board, images, figures)
+    figures = replace(
+        figures, held_out_px={name: lens.held_out_px for name, lens in lenses.items()}
+    )
+    findings = judge_calibration(
+        seen.board, images, figures, list(lens_faults(lenses, config.calibration.model))
+    )
     summary = CalibrationSummary(
         figures=figures,
         model=config.calibration.model,
@@ -292,7 +324,7 @@ def _figures(
     epipolar_error_px: Float64,
     rectified_focal_px: float,
 ) -> CalibrationFigures:
-    rig, away_m, away = fit.calibration, _distances_m(fit), spread.working
+    rig, away_m, away = fit.calibration, distances_m(fit), spread.working
     # Angles between the board's normal and the optical axis of the left camera.
     tilts_deg = np.degrees(np.arccos(np.clip(np.abs(fit.state.T_rig_board[:, 2, 2]), 0.0, 1.0)))
     return CalibrationFigures(
@@ -321,8 +353,8 @@ def _figures(
             view.name: [float(value) for value in errors]
             for view, errors in zip(fit.views, fit.errors_px, strict=True)
         },
-        coverage_left=_coverage([view.seen[0].pixels for view in fit.views], rig.left),
-        coverage_right=_coverage([view.seen[1].pixels for view in fit.views], rig.right),
+        coverage_left=float(seen_cells(fit, 0).mean()),
+        coverage_right=float(seen_cells(fit, 1).mean()),
         tilt_max_deg=float(tilts_deg.max()),
         tilted_ratio=float((tilts_deg >= TILT_DEG).mean()),
         far_to_near=float(away_m.max() / away_m.min()),
@@ -353,20 +385,3 @@ def shared_pixels(view: View) -> tuple[Float64, Float64]:
     left, right = view.seen
     _, of_left, of_right = np.intersect1d(left.numbers, right.numbers, return_indices=True)
     return left.pixels[of_left], right.pixels[of_right]
-
-
-def _coverage(pixels: Sequence[Float64], camera: CameraIntrinsics) -> float:
-    """Return the fraction of image cells in which a corner was seen, in [0, 1]."""
-    size = np.array([camera.width_px, camera.height_px])
-    cells = np.floor((np.concatenate(pixels) + 0.5) / size * _CELLS).astype(int)
-    inside = np.clip(cells, 0, np.array(_CELLS) - 1)
-    return len(np.unique(inside, axis=0)) / (_CELLS[0] * _CELLS[1])
-
-
-def _distances_m(fit: StereoFit) -> Float64:
-    """Return float64 (V,), distance of the middle of the board from the left camera."""
-    middles = [
-        (T @ [*view.seen[0].board_m.mean(axis=0), 1.0])[:3]
-        for T, view in zip(fit.state.T_rig_board, fit.views, strict=True)
-    ]
-    return np.asarray(np.linalg.norm(middles, axis=1))

@@ -17,10 +17,10 @@ from recon.rig.board_sheet import choose_sheet, write_board
 from recon.rig.calibrate.detect import (
     check_charuco,
     check_chessboard,
-    find_board,
     grown_size,
     orient_like,
 )
+from recon.rig.calibrate.patterns import find_board
 from tests.scenery.boards import BoardView, board_rig, place_boards, render_views
 
 CHESS = "chess:9x6:25mm"

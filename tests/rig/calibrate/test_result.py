@@ -10,10 +10,15 @@ from recon.core.values.board import parse_board
 from recon.io.cameras.calibration import read_calibration
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.figures import WorkingError
-from recon.rig.calibrate.stereo import calibrate_stereo, measure_spread
+from recon.rig.calibrate.lenses import LensChoice, compare_lenses
+from recon.rig.calibrate.stereo import (
+    calibrate_stereo,
+    measure_spread,
+)
 from recon.rig.calibrate.verdict import (
     describe_calibration,
     judge_calibration,
+    lens_faults,
     verdict_of_calibration,
     write_calibration,
 )
@@ -44,7 +49,9 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     pixels = np.concatenate([view.seen[0].pixels for view in views])
     cells = {(int((u + 0.5) // 80), int((v + 0.5) // 80)) for u, v in pixels}
     assert found["coverage_left"] == len(cells) / 48
-    assert found["depth_error_cm"]["2"]["high"] == pytest.approx(100 * spread.depths[0].high_m)
+    at = f"{spread.depths[0].depth_m:g}"  # of the board
+    assert min(away) < float(at) < max(away)
+    assert found["depth_error_cm"][at]["high"] == pytest.approx(100 * spread.depths[0].high_m)
     for form in get_args(CalibrationForm):
         files = write_calibration(tmp_path / form / "rig.yaml", run, form)
         read = read_calibration(files[0], *SIZE)
@@ -125,3 +132,34 @@ def test_what_was_left_out_is_noted_and_changes_no_verdict():
     assert verdict == "good"
     assert set(found) == {"square", "board", "dropped", "repeats"}
     assert found["repeats"].startswith("2 views with the board where another one has it")
+
+
+def test_a_lens_that_fits_as_well_with_fewer_coefficients_is_proposed_and_none_where_none_fits():
+    rational, fisheye = (
+        LensChoice(0.42, 16, 0.06, suits=True),
+        LensChoice(0.43, 8, 0.01, suits=True),
+    )
+    lenses = {"rational": rational, "fisheye": fisheye}
+    (code, figures), *others = lens_faults(lenses, "rational")
+    assert (code, figures["best"], others) == ("model", "fisheye", [])
+    assert "8 fewer" in figures["fewer"]
+    assert not list(lens_faults(lenses, "fisheye"))
+    # A lens that is good already is kept, unless it fits worse beyond chance.
+    good = {**lenses, "rational": replace(rational, working_ratio=0.015)}
+    assert not list(lens_faults(good, "rational"))
+    worse = {**lenses, "rational": replace(rational, working_ratio=0.015, suits=False)}
+    assert [code for code, _ in lens_faults(worse, "rational")] == ["model"]
+    bad = {"radtan": LensChoice(0.8, 10, 0.01, suits=True)}
+    assert [code for code, _ in lens_faults(bad, "radtan")] == ["lens"]
+
+
+def test_a_wide_lens_is_told_from_a_rational_one_and_judged_where_the_board_was(make_views):
+    _, views = make_views("fisheye", count=14, sigma_px=0.2)
+    settings = CalibrationSettings(model="rational")
+    fit = calibrate_stereo(views, SIZE, settings)
+    lenses = compare_lenses(fit, SIZE, settings)
+    assert lenses["fisheye"].suits
+    assert lenses["fisheye"].held_out_px < lenses["rational"].held_out_px
+    assert lenses["fisheye"].working_ratio < lenses["rational"].working_ratio / 3
+    (code, figures), *_ = lens_faults(lenses, "rational")
+    assert (code, figures["best"]) == ("model", "fisheye")
