@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
+from pydantic import field_validator
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform, transform_cloud
@@ -32,11 +33,26 @@ _TRIALS: Final = 300  # random planes that are tried
 
 
 class AxesSettings(Settings):
-    """Where the map has its origin."""
+    """Where the map has its origin, and what is up in it."""
 
     origin: Literal["camera", "ground"] = "camera"
     """Origin of the map: the first left camera, or the ground below it, so that z = 0 is on the
     ground at the start."""
+    up: tuple[float, float, float] | None = None
+    """What is up in the axes of the first left camera (right, down, forward), such as `[0, 0, -1]`
+    where it looks straight down; none = as inertial unit, robot or surfaces show."""
+
+    @field_validator("up")
+    @classmethod
+    def _check_up(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if up is not None and not 1e-6 < math.hypot(*up) < 1e6:
+            raise ValueError("up must be a direction: finite, and not zero")
+        return up
+
+    @property
+    def known_up(self) -> Float64 | None:
+        """float64 (3,), of unit length; None = not set."""
+        return None if self.up is None else np.array(self.up) / math.hypot(*self.up)
 
 
 @dataclass(frozen=True, eq=False)
