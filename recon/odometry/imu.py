@@ -210,8 +210,9 @@ def up_of_drive(guide: ImuGuide, run: ImuSpan) -> tuple[Float64, float] | None:
     for first in np.unique(np.searchsorted(times_s, starts_s)).tolist():
         own = slice(first, int(np.searchsorted(times_s, times_s[first] + _UP_SPAN_S, "right")))
         path = Trajectory(invert(T[first]) @ T[own], times_s[own])
-        part = ImuSpan(path, run.sigma_m[own][: len(path) - 1], run.sigma_rad[own][: len(path) - 1])
-        up, _ = find_up(guide.gyro, part, guide.arm_m)
+        steps = slice(first, first + len(path) - 1)
+        part = ImuSpan(path, run.sigma_m[steps], run.sigma_rad[steps])
+        up = find_up(guide.gyro, part, guide.arm_m)[0] if np.isfinite(part.sigma_m).all() else None
         if up is not None:
             ups.append(T[first, :3, :3] @ up)
     if not ups:

@@ -11,7 +11,7 @@ import numpy as np
 from recon.core.geometry.se3 import rotate
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import side_by_side
-from recon.map.ground.axes import estimate_ground, map_axes
+from recon.map.ground.axes import UP_MAP, short_turn
 from recon.map.ground.level import Level, level_by_surfaces
 from recon.map.sessions.placed import CastSubmaps
 from recon.map.settings import DriveSettings
@@ -35,8 +35,7 @@ def level_drive(
     again of its rays. What is set or a robot says stays, but for what an inertial unit says.
     """
     before = session.level
-    done = before is None or before.by == "setting" or math.isfinite(before.sigma_deg)
-    if before is None or done or not placed.any():
+    if before.by == "setting" or math.isfinite(before.sigma_deg) or not placed.any():
         return
     up, level = None, before
     if guide is not None:
@@ -51,7 +50,9 @@ def level_drive(
     off_deg = math.degrees(math.acos(np.clip(session.T_map_world[2, :3] @ up, -1.0, 1.0)))
     turned = off_deg > _SIGMAS * level.sigma_deg and session.ray_frames == len(session)
     session.level = level if turned else replace(level, sigma_deg=max(level.sigma_deg, off_deg))
-    T_map_world = _axes(session, settings, up) if turned else session.T_map_world
+    T_map_world = session.T_map_world
+    if turned:  # the short way; what the origin is above stays so far below
+        T_map_world[:3, :3] = short_turn(T_map_world[:3, :3] @ up, UP_MAP) @ T_map_world[:3, :3]
     session.set_axes(T_map_world, session.camera)
     if turned:
         cast = CastSubmaps(session, settings)
@@ -59,24 +60,11 @@ def level_drive(
             session.submaps.add(submap)
 
 
-def _axes(session: Session, settings: DriveSettings, up: Float64) -> Float64:
-    """Return T_map_world (4, 4) for what is up (3,), world axes, by the first surfaces seen."""
-    fused, mount = session.submaps[0].fused, session.mount
-    cloud = replace(fused.cloud(settings.fusion.voxel_m, 1), frame="camera")
-    ground = estimate_ground(cloud, settings.scale, up)
-    mounted_m = None if mount is None else mount.camera_height_m
-    height_m = settings.ground.camera_height_m or mounted_m
-    if ground is None and height_m is None:
-        height_m = float(session.T_map_world[2, 3])
-    turn = None if mount is None else mount.T_base_camera[:3, :3]
-    return map_axes(ground, settings.axes, height_m, up, turn)
-
-
 def _by_imu(session: Session, placed: Bool, guide: ImuGuide) -> tuple[Float64, Level] | None:
     """Return what is up by an inertial unit; None = it does not know."""
     health = [one for one, there in zip(session.health, placed, strict=True) if there]
-    sigmas = np.array([(one.sigma_m, math.radians(one.sigma_deg)) for one in health[1:]])
-    run = ImuSpan(session.trajectory.select(placed), *sigmas.reshape(-1, 2).T)
+    sigma_m = np.array([one.sigma_m for one in health[1:]])
+    run = ImuSpan(session.trajectory.select(placed), sigma_m, np.zeros_like(sigma_m))
     found = up_of_drive(guide, run)
     return None if found is None else (found[0], Level("imu", found[1]))
 

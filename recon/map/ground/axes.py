@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import field_validator
 
 from recon.core.errors import MappingError
@@ -18,6 +19,7 @@ from recon.sources.source import Mount
 
 AXES_MAP_WORLD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The turn from camera-like axes (right, down, forward) to map axes (forward, left, up)."""
+UP_MAP: Final = np.array([0.0, 0.0, 1.0])
 _UP_CAMERA: Final = np.array([0.0, -1.0, 0.0])
 _MAX_TILT_DEG: Final = 30.0  # planes tilted more than this are no ground
 _MIN_TILT_DEG: Final = 3.0
@@ -48,11 +50,6 @@ class AxesSettings(Settings):
         if up is not None and not 1e-6 < math.hypot(*up) < 1e6:
             raise ValueError("up must be a direction: finite, and not zero")
         return up
-
-    @property
-    def known_up(self) -> Float64 | None:
-        """float64 (3,), of unit length; None = not set."""
-        return None if self.up is None else np.array(self.up) / math.hypot(*self.up)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +93,7 @@ def map_axes(
     if free and ground is not None and ground.tilt_deg > _MIN_TILT_DEG:
         up = ground.normal
     if up is not None:
-        turn = _short_turn(turn @ up, np.array([0.0, 0.0, 1.0])) @ turn
+        turn = short_turn(turn @ up, UP_MAP) @ turn
     height_m = 0.0
     if settings.origin == "ground" and camera_height_m is not None:
         height_m = camera_height_m
@@ -109,7 +106,13 @@ def map_axes(
     return make_transform(turn, np.array([0.0, 0.0, height_m]))
 
 
-def _short_turn(first: Float64, second: Float64) -> Float64:
+def unit(direction: ArrayLike) -> Float64:
+    """Return a direction (3,) with unit length."""
+    found = np.asarray(direction, np.float64)
+    return np.asarray(found / np.linalg.norm(found))
+
+
+def short_turn(first: Float64, second: Float64) -> Float64:
     """Return the smallest rotation (3, 3) that takes one direction to another."""
     axis = np.cross(first, second)
     angle = math.acos(min(1.0, max(-1.0, float(first @ second))))
@@ -143,7 +146,7 @@ def estimate_ground(
     Ref: M. Fischler and R. Bolles, "Random sample consensus", CACM 24, 1981.
     """
     if up is not None:
-        turn = make_transform(_short_turn(up, _UP_CAMERA), np.zeros(3))
+        turn = make_transform(short_turn(up, _UP_CAMERA), np.zeros(3))
         plane = estimate_ground(transform_cloud(cloud, turn, frame="camera"), scale)
         return None if plane is None else replace(plane, normal=plane.normal @ turn[:3, :3])
     xyz, inlier_m = cloud.xyz.astype(np.float64), scale * _INLIER_M

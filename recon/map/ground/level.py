@@ -9,6 +9,7 @@ of a drive disagree, it is not known.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,7 +20,7 @@ from recon.core.values.arrays import Float64
 _WITHIN_DEG: Final = 8.0  # of level or upright, what a garden still is
 _DIRECTIONS: Final = 4000  # that are tried, 3° apart
 _MOST_NORMALS: Final = 20_000
-_LEAST_NORMALS: Final = 500  # of a part of the drive
+_LEAST_NORMALS: Final = 100  # of a part of the drive
 _PARTS: Final = 8
 _MOST_SIGMA_DEG: Final = 3.0
 _SLOPE_DEG: Final = 1.0  # standard deviation of the slope of ground
@@ -27,7 +28,9 @@ _TILT: Final = 0.75  # nats for each unit of 1 - cos of the angle to the camera'
 _DOUBTED_DEG: Final = 50.0  # a camera that is tilted more may as well look at a wall
 _TURNED: Final = 0.5  # length of the mean of the camera's own up, below which it says nothing
 _CLIMBED: Final = 0.5  # part of the motion, squared, that is too much to be up a wall
-_ONE_SIDED: Final = 4.0  # times as many surfaces face up as down where no ceiling is seen
+_DENSER: Final = 1.75  # times as many normals lie near a direction that is that of something flat
+_ACROSS: Final = 0.1  # of walls alone, that must stand across the others
+_LEAST_RATIO: Final = 0.02  # of all normals, that are of more than a table
 NOT_KNOWN: Final = "not known"
 TOO_FEW: Final = "too few surfaces were seen"
 
@@ -36,7 +39,7 @@ TOO_FEW: Final = "too few surfaces were seen"
 class Level:
     """By what a map is level, and how well: ``sigma_deg`` of what is up; NaN = not estimated."""
 
-    by: str  # setting, imu, robot, surfaces, first frame, or `NOT_KNOWN`
+    by: str = "first frame"  # or setting, imu, robot, surfaces, or `NOT_KNOWN`
     sigma_deg: float = math.nan
     why: str = ""  # it is not known
 
@@ -44,6 +47,13 @@ class Level:
     def contradicted(self) -> bool:
         """Whether what was seen of the drive contradicts what seems to be up."""
         return self.by == NOT_KNOWN and self.why != TOO_FEW
+
+    @property
+    def text(self) -> str:
+        if self.by == NOT_KNOWN:
+            return "what is up is not known"
+        known = "" if math.isnan(self.sigma_deg) else f" to {self.sigma_deg:.1f}°"
+        return f"level{known} by {self.by}"
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -65,9 +75,8 @@ def level_by_surfaces(normals: Float64, T_world_camera: Float64) -> tuple[Float6
     normals = normals[:: math.ceil(len(normals) / _MOST_NORMALS)]
     held = -T_world_camera[:, :3, 1].mean(axis=0)
     tried = _directions()
-    cos = tried @ held / max(float(np.linalg.norm(held)), 1e-9)
-    best = int(np.argmax(_likelihood(normals, tried) - _TILT * np.linalg.norm(held) * (1.0 - cos)))
-    up = _refined(normals, tried[best])
+    likely = _likelihood(normals[::4], tried) - _TILT * (np.linalg.norm(held) - tried @ held)
+    up = _refined(normals, tried[int(np.argmax(likely))])
     apart = [_refined(part, up) for part in np.array_split(normals, _PARTS)]
     spread = np.degrees(np.sqrt(np.mean([1.0 - (one @ up) ** 2 for one in apart]) / _PARTS))
     sigma_deg = float(np.hypot(spread, _SLOPE_DEG))
@@ -111,16 +120,31 @@ def _refined(normals: Float64, up: Float64) -> Float64:
 
 def _doubt(normals: Float64, up: Float64, T_world_camera: Float64, held: Float64) -> str:
     """Return why a direction may not be up although surfaces look as if, or nothing."""
-    cos, near = normals @ up, math.cos(math.radians(_WITHIN_DEG))
-    steady, tilt = float(np.linalg.norm(held)), float(held @ up) / float(np.linalg.norm(held))
-    if tilt >= math.cos(math.radians(_DOUBTED_DEG)) or steady < _TURNED:
+    cos = normals @ up
+    floor, ceiling = _stands_out(1.0 - cos), _stands_out(1.0 + cos)
+    walls = normals[np.abs(cos) < math.sin(math.radians(_WITHIN_DEG))]
+    alike = np.linalg.eigvalsh(walls.T @ walls)[1] < _ACROSS * len(walls)
+    if not (floor or ceiling) and (alike or not _stands_out(np.abs(cos), math.sin)):
+        return "surfaces are no more level or upright than anything else"
+    steady, doubted = float(np.linalg.norm(held)), math.cos(math.radians(_DOUBTED_DEG))
+    tilt = float(held @ up) / max(steady, 1e-9)
+    if tilt >= doubted or (steady < _TURNED and floor):
         return ""
-    if tilt <= -math.cos(math.radians(_DOUBTED_DEG)):
-        roofed = _ONE_SIDED * np.mean(cos < -near) > np.mean(cos > near)
-        alike = "the camera seems upside down, and floors and ceilings look alike"
-        return alike if roofed else ""
+    if tilt <= -doubted:
+        return "" if floor and not ceiling else "the camera seems upside down, and sees no ground"
     # Were the surface that seems to be the ground a wall, the camera would have climbed.
     climb = held - (held @ up) * up
     moved = np.diff(T_world_camera[:, :3, 3], axis=0)
     climbed = np.sum((moved @ climb) ** 2) / max(float(climb @ climb * np.sum(moved**2)), 1e-12)
-    return "" if climbed > _CLIMBED else "the camera looks down at the ground, or at a wall"
+    known = floor and climbed > _CLIMBED
+    return "" if known else "the camera looks down at the ground, or at a wall"
+
+
+def _stands_out(away: Float64, of: Callable[[float], float] = lambda a: 1.0 - math.cos(a)) -> bool:
+    """Return whether normals are denser near a direction, or plane, than twice as far away.
+
+    ``away`` (N,) grows evenly with the solid angle, which ``of`` gives of a distance in radians.
+    """
+    near, far = of(math.radians(_WITHIN_DEG)), of(math.radians(2.0 * _WITHIN_DEG))
+    inside, outside = float(np.mean(away < near)), float(np.mean((away >= near) & (away < far)))
+    return inside > _LEAST_RATIO and inside * (far - near) > _DENSER * outside * near

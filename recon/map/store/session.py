@@ -75,7 +75,7 @@ class Session:
     """One drive in a map; the next commit of the map keeps what is added.
 
     ``mount`` is where the rectified left camera is on its robot, which is kept with the axes; None
-    = nothing says so. ``level`` is by what its axes are level; None = older maps do not say it.
+    = nothing says so. ``level`` is by what its axes are level.
     """
 
     def __init__(self, store: Store, number: int) -> None:
@@ -97,7 +97,7 @@ class Session:
             self.mount = value_in(Mount, axes["mount"]) if "mount" in axes else None
             if self.mount is not None:
                 check_rigid("T_base_camera", self.mount.T_base_camera)
-            self.level = value_in(Level, axes["level"]) if "level" in axes else None
+            self.level = value_in(Level, axes.get("level", {}))
             if sorted(self._times_s) != self._times_s:
                 raise FormatError("frames of the drive are not in order")
             for name in (OPTIMISED_POSES, POSES_BEFORE_LINKS):
@@ -200,9 +200,7 @@ class Session:
         content = {"T_map_world": T_map_world, "camera": asdict(camera)}
         if self.mount is not None:
             content["mount"] = asdict(self.mount)
-        if self.level is not None:
-            content["level"] = asdict(self.level)
-        self._store.put(AXES, self.number, content)
+        self._store.put(AXES, self.number, content | {"level": asdict(self.level)})
 
     @property
     def rig(self) -> KnownRig | None:
