@@ -12,7 +12,7 @@ from recon.core.geometry.se3 import rotate
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import side_by_side
 from recon.map.ground.axes import UP_MAP, short_turn
-from recon.map.ground.level import Level, level_by_surfaces
+from recon.map.ground.level import TOO_FEW, Level, level_by_surfaces
 from recon.map.sessions.placed import CastSubmaps
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
@@ -44,7 +44,7 @@ def level_drive(
         path = session.trajectory.T_world_camera[placed]
         up, level = level_by_surfaces(_normals(session, settings, placed), path)
     if up is None:  # that too little was seen does not make the first frame wrong
-        session.level = level if level.contradicted else before
+        session.level = before if level.why == TOO_FEW else level
         session.set_axes(session.T_map_world, session.camera)
         return
     off_deg = math.degrees(math.acos(np.clip(session.T_map_world[2, :3] @ up, -1.0, 1.0)))

@@ -26,7 +26,7 @@ from recon.map.builders import (
     thin_rays,
 )
 from recon.map.fusion import FusionSettings, fusion_range_m
-from recon.map.ground.axes import estimate_ground, map_axes, unit
+from recon.map.ground.axes import estimate_ground, map_axes
 from recon.map.ground.level import NOT_KNOWN, TOO_FEW, Level
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
@@ -156,7 +156,9 @@ class Mapper:
         is forgotten where the only ground is one that it cannot stand on.
         """
         config, cloud, R_base_world = self._config, cloud.only_measured(), None
-        up = self._up if config.axes.up is None else unit(config.axes.up)
+        up, given = self._up, config.axes.up
+        if given is not None:
+            up = np.array(given) / math.hypot(*given)
         ground, height_m = estimate_ground(cloud, config.scale, up), None
         if (mount := self.session.mount) is not None:
             R_base_world, height_m = mount.T_base_camera[:3, :3], mount.camera_height_m

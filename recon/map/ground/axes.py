@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import field_validator
 
 from recon.core.errors import MappingError
@@ -104,12 +103,6 @@ def map_axes(
             raise MappingError(what, hint=hint)
         height_m = ground.height_m / float(turn[2] @ ground.normal)
     return make_transform(turn, np.array([0.0, 0.0, height_m]))
-
-
-def unit(direction: ArrayLike) -> Float64:
-    """Return a direction (3,) with unit length."""
-    found = np.asarray(direction, np.float64)
-    return np.asarray(found / np.linalg.norm(found))
 
 
 def short_turn(first: Float64, second: Float64) -> Float64:

@@ -44,11 +44,6 @@ class Level:
     why: str = ""  # it is not known
 
     @property
-    def contradicted(self) -> bool:
-        """Whether what was seen of the drive contradicts what seems to be up."""
-        return self.by == NOT_KNOWN and self.why != TOO_FEW
-
-    @property
     def text(self) -> str:
         if self.by == NOT_KNOWN:
             return "what is up is not known"

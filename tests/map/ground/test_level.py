@@ -108,7 +108,6 @@ def test_too_little_contradicts_nothing() -> None:
     up, level = level_by_surfaces(normals, _path(_mounted(), _UP))
     assert up is None
     assert level.why == TOO_FEW
-    assert not level.contradicted
 
 
 def test_uneven_ground_is_known_less_well() -> None:
