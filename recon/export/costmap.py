@@ -95,7 +95,7 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
             f"{ratio} of the ground seen is steeper than robot.max_slope_percent={limit}: {level}"
         )
         warnings = (*warnings, text)
-    return grid, warnings
+    return grid, (*map_.first.level.warnings, *warnings)
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from recon.map.ground.grid import (
     is_driven,
     sweep,
 )
+from recon.map.ground.level import Level
 from recon.map.ground.surface import (
     GroundSettings,
     GroundSurface,
@@ -68,11 +69,12 @@ class GridFigures(ProductFigures):
     free_cells: int
     camera_height_m: float | None  # None = unknown, or not at one height
     T_base_camera: Float64  # (4, 4)
+    level: Level
 
     @property
     def text(self) -> str:
         sides = (metres(cells * self.resolution_m) for cells in (self.columns, self.rows))
-        return f"{' × '.join(sides)}, cells of {self.resolution_m:g} m"
+        return f"{' × '.join(sides)}, cells of {self.resolution_m:g} m, {self.level.text}"
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,9 @@ def grid_product(context: ExportContext, path: Path) -> ExportResult:
         free_cells=int((grid.cells == FREE).sum()),
         camera_height_m=height_m,
         T_base_camera=base_axes(first.T_map_world, height_m, first.mount),
+        level=first.level,
     )
-    return ExportResult(figures, warnings, grid)
+    return ExportResult(figures, (*first.level.warnings, *warnings), grid)
 
 
 Finish = Callable[[OccupancyGrid, GroundSurface, Int32], OccupancyGrid]

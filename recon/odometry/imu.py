@@ -6,14 +6,14 @@ Where it goes is not integrated: the camera goes on as it did, as surely as it d
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from typing import Final
 
 import numpy as np
 
-from recon.core.geometry.se3 import Motion, hat, make_transform
+from recon.core.geometry.se3 import Motion, hat, invert, make_transform
 from recon.core.summary import Figures
 from recon.core.values import ImuRecord, Trajectory
 from recon.core.values.arrays import Float64
@@ -121,6 +121,7 @@ class ImuGuide:
     step_m: float  # standard deviation of a motion that is seen
     up: Float64 | None = None  # (3,), upwards in the axes of the first frame; None = not known
     scale: float = 1.0  # size of the scene against a road
+    arm_m: Float64 = field(default_factory=lambda: np.zeros(3))  # where the unit is, camera axes
 
     def guide(self, last: Motion, seen: Motion, to_s: float) -> Guided | None:
         """Return the turn since the last frame that was seen, and the same velocity as before."""
@@ -195,6 +196,30 @@ def find_up(gyro: Gyro, run: ImuSpan, arm_m: Float64) -> tuple[Float64 | None, f
     if wrong or sigma_deg > _MOST_UP_DEG:
         return None, sigma_deg
     return -gravity / np.linalg.norm(gravity), sigma_deg
+
+
+def up_of_drive(guide: ImuGuide, run: ImuSpan) -> tuple[Float64, float] | None:
+    """Return what is up (3,) in the axes of a path, all along it, and how well, degrees.
+
+    Of accelerations nothing is left on average; what the accelerometer is off stays. None = it is
+    not known anywhere.
+    """
+    times_s, T = run.path.timestamps_s, run.path.T_world_camera
+    starts_s = np.arange(times_s[0], times_s[-1], _UP_SPAN_S)
+    ups = []
+    for first in np.unique(np.searchsorted(times_s, starts_s)).tolist():
+        own = slice(first, int(np.searchsorted(times_s, times_s[first] + _UP_SPAN_S, "right")))
+        path = Trajectory(invert(T[first]) @ T[own], times_s[own])
+        steps = slice(first, first + len(path) - 1)
+        part = ImuSpan(path, run.sigma_m[steps], run.sigma_rad[steps])
+        up = find_up(guide.gyro, part, guide.arm_m)[0] if np.isfinite(part.sigma_m).all() else None
+        if up is not None:
+            ups.append(T[first, :3, :3] @ up)
+    if not ups:
+        return None
+    up = np.mean(ups, axis=0) / np.linalg.norm(np.mean(ups, axis=0))
+    spread = np.sqrt(np.mean(1.0 - np.square(np.stack(ups) @ up)) / len(ups))
+    return up, float(np.rad2deg(np.hypot(spread, _FORCE / _G)))
 
 
 def doubt_forces(record: ImuRecord) -> tuple[str, ...]:

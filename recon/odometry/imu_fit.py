@@ -130,7 +130,8 @@ def fit_imu(
     arm_m = np.zeros(3) if T_stated is None else T_stated[:3, 3]
     up, up_deg = find_up(fit.gyro, runs[0], arm_m) if begins else (None, float("nan"))
     step_m = float(np.median(np.concatenate([run.sigma_m for run in runs])))
-    guide = ImuGuide(fit.gyro, fit.covariance, fit.noise, accelerations(fit.gyro), step_m, up)
+    unsteady = accelerations(fit.gyro)
+    guide = ImuGuide(fit.gyro, fit.covariance, fit.noise, unsteady, step_m, up, arm_m=arm_m)
     lines = (*notes, *(f"IMU: {fault}; used as found" for fault in faults))
     found = ImuFit(
         origin=record.origin,

@@ -174,7 +174,7 @@ def test_transforms_that_no_robot_can_have_change_nothing_and_are_said(mapped):
     for run in (none, wrong):
         assert "base_frame" not in summary_of(run)
         with Map.open(run) as map_:
-            assert map_.store.get(AXES, 0).keys() == {"T_map_world", "camera"}
+            assert map_.store.get(AXES, 0).keys() == {"T_map_world", "camera", "level"}
 
 
 def test_another_robot_is_located_by_its_own_base(driven, mapped, tmp_path):

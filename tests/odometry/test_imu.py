@@ -10,7 +10,7 @@ from recon.core.geometry.se3 import Motion, angle_rad, exp_so3, invert, log_so3,
 from recon.core.values import ImuRecord, Trajectory
 from recon.odometry.checked import CheckedOdometry
 from recon.odometry.guide import Guided
-from recon.odometry.imu import Gyro, ImuGuide, ImuSpan
+from recon.odometry.imu import Gyro, ImuGuide, ImuSpan, up_of_drive
 from recon.odometry.imu_fit import fit_imu
 from recon.odometry.visual import VisualOdometry
 from tests.odometry.conftest import CAMERA
@@ -71,6 +71,18 @@ FAULTS = {
     "cycled axes": (lambda r: turned(r, CYCLE), r"axes are turned by 120 ± 0\.\d° from those st"),
     "swapped axes": (lambda r: turned(r, SWAP), "axes are left-handed; used as found"),
 }
+
+
+def test_up_is_found_all_along_a_path_whose_frames_are_partly_lost(record):
+    fitted, run = fit_imu(record, FRAMES_S, seen, T_CAMERA_IMU), seen()[0]
+    up, sigma_deg = up_of_drive(fitted.guide, run)
+    assert np.rad2deg(np.arccos(up @ UP)) < sigma_deg < 1.0
+    lost = replace(run, sigma_m=np.where(np.arange(len(run.sigma_m)) == 3, np.nan, run.sigma_m))
+    up, _ = up_of_drive(fitted.guide, lost)
+    assert np.rad2deg(np.arccos(up @ UP)) < 1.0
+    assert (
+        up_of_drive(fitted.guide, replace(run, sigma_m=np.full_like(run.sigma_m, np.nan))) is None
+    )
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -26,6 +26,7 @@ from recon.io.files import reading
 from recon.look.tracks import LiveTracks
 from recon.map.builders import thin_rays
 from recon.map.drive.drive_loops import DriveLoops, LoopWatch
+from recon.map.drive.levelling import level_drive
 from recon.map.drive.mapper import FrameResult, Mapper
 from recon.map.listener import NOBODY, DriveBegun, DriveListener, PoseTeller
 from recon.map.map import Map
@@ -33,6 +34,7 @@ from recon.map.occupancy.gone import texture_of
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session, SessionInfo
 from recon.odometry.health import segment_numbers
+from recon.odometry.imu import ImuGuide
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.places.detector import LastView, NewViews
 from recon.places.keyframe import coarse_of
@@ -60,7 +62,7 @@ class Drive:
     ) -> None:
         self.source, self.reconstructor, self.config = source, reconstructor, config
         self.mapper, self.session = mapper, mapper.session
-        self._total = len(source)
+        self._total, self._threads = len(source), workspace.threads or 1
         self._loops, self._map = loops, workspace.map
         self._views = NewViews(reconstructor.camera)
         self._stage = workspace.stopwatch.stage
@@ -168,14 +170,21 @@ class Drive:
             self._save()
         self.mapper.close()
 
-    def close_loops(self, path: Trajectory) -> DriveLoops | None:
-        """Return the loops of the path, which the map keeps; None = they are not looked for."""
-        if not self._loops.searching:
-            return None
-        with self._stage("close_loops"):
-            loops = self._loops.close(path, self.session.health)
-            self.session.set_loops(loops.record())
-            return loops
+    def settle(self, path: Trajectory, guide: ImuGuide | None = None) -> DriveLoops | None:
+        """Close the loops of the path, and make the map level by all of it, unless it arrived live.
+
+        Returns the loops, which the map keeps; None = they are not looked for.
+        """
+        loops = None
+        if self._loops.searching:
+            with self._stage("close_loops"):
+                loops = self._loops.close(path, self.session.health)
+                self.session.set_loops(loops.record())
+        if not self.source.live:
+            with self._stage("level"):
+                placed = self._map.placed.get(self.session.number, self.session.trusted)
+                level_drive(self.session, self.config, placed, guide, self._threads)
+        return loops
 
     def sample_again(self) -> ReconstructedFrame:
         """Reconstruct the frame in the middle, which was mapped before this process started."""

@@ -27,6 +27,7 @@ from recon.map.builders import (
 )
 from recon.map.fusion import FusionSettings, fusion_range_m, voxel_doublings
 from recon.map.ground.axes import estimate_ground, map_axes
+from recon.map.ground.level import NOT_KNOWN, TOO_FEW, Level
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
 from recon.odometry.checked import SegmentCounter
@@ -156,7 +157,10 @@ class Mapper:
         is forgotten where the only ground is one that it cannot stand on.
         """
         config, cloud, R_base_world = self._config, cloud.only_measured(), None
-        ground, height_m = estimate_ground(cloud, config.scale, self._up), None
+        up, given = self._up, config.axes.up
+        if given is not None:
+            up = np.array(given) / math.hypot(*given)
+        ground, height_m = estimate_ground(cloud, config.scale, up), None
         if (mount := self.session.mount) is not None:
             R_base_world, height_m = mount.T_base_camera[:3, :3], mount.camera_height_m
             below = estimate_ground(cloud, config.scale, R_base_world[2])
@@ -164,7 +168,10 @@ class Mapper:
                 self.session.mount = R_base_world = height_m = None
             ground = below or ground
         height_m = config.ground.camera_height_m or height_m
-        T_map_world = map_axes(ground, config.axes, height_m, self._up, R_base_world)
+        T_map_world = map_axes(ground, config.axes, height_m, up, R_base_world)
+        by = "robot" if R_base_world is not None else "first frame" if ground else NOT_KNOWN
+        by = "setting" if config.axes.up is not None else by if up is None else "imu"
+        self.session.level = Level(by, why="" if ground else TOO_FEW)
         self.session.set_axes(T_map_world, self._camera)
         seen_m = None if ground is None else ground.height_m
         self.axes = T_map_world, config.ground.camera_height_m or seen_m

@@ -280,7 +280,7 @@ def map_sequence(
         config=config,
         sample=drive.sample or drive.sample_again(),
         seconds=drive.seconds,
-        loops=drive.close_loops(session.odometry),
+        loops=drive.settle(session.odometry, None if imu is None else imu.guide),
         prior=used,
         imu=imu,
         doubts=doubts,

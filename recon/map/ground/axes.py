@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
+from pydantic import field_validator
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import exp_so3, make_transform, transform_cloud
@@ -17,6 +18,7 @@ from recon.sources.source import Mount
 
 AXES_MAP_WORLD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """The turn from camera-like axes (right, down, forward) to map axes (forward, left, up)."""
+UP_MAP: Final = np.array([0.0, 0.0, 1.0])
 _UP_CAMERA: Final = np.array([0.0, -1.0, 0.0])
 _MAX_TILT_DEG: Final = 30.0  # planes tilted more than this are no ground
 _MIN_TILT_DEG: Final = 3.0
@@ -32,11 +34,21 @@ _TRIALS: Final = 300  # random planes that are tried
 
 
 class AxesSettings(Settings):
-    """Where the map has its origin."""
+    """Where the map has its origin, and what is up in it."""
 
     origin: Literal["camera", "ground"] = "camera"
     """Origin of the map: the first left camera, or the ground below it, so that z = 0 is on the
     ground at the start."""
+    up: tuple[float, float, float] | None = None
+    """What is up in the axes of the first left camera (right, down, forward), such as `[0, 0, -1]`
+    where it looks straight down; none = as inertial unit, robot or surfaces show."""
+
+    @field_validator("up")
+    @classmethod
+    def _check_up(cls, up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if up is not None and not 1e-6 < math.hypot(*up) < 1e6:
+            raise ValueError("up must be a direction: finite, and not zero")
+        return up
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +92,7 @@ def map_axes(
     if free and ground is not None and ground.tilt_deg > _MIN_TILT_DEG:
         up = ground.normal
     if up is not None:
-        turn = _short_turn(turn @ up, np.array([0.0, 0.0, 1.0])) @ turn
+        turn = short_turn(turn @ up, UP_MAP) @ turn
     height_m = 0.0
     if settings.origin == "ground" and camera_height_m is not None:
         height_m = camera_height_m
@@ -93,7 +105,7 @@ def map_axes(
     return make_transform(turn, np.array([0.0, 0.0, height_m]))
 
 
-def _short_turn(first: Float64, second: Float64) -> Float64:
+def short_turn(first: Float64, second: Float64) -> Float64:
     """Return the smallest rotation (3, 3) that takes one direction to another."""
     axis = np.cross(first, second)
     angle = math.acos(min(1.0, max(-1.0, float(first @ second))))
@@ -127,7 +139,7 @@ def estimate_ground(
     Ref: M. Fischler and R. Bolles, "Random sample consensus", CACM 24, 1981.
     """
     if up is not None:
-        turn = make_transform(_short_turn(up, _UP_CAMERA), np.zeros(3))
+        turn = make_transform(short_turn(up, _UP_CAMERA), np.zeros(3))
         plane = estimate_ground(transform_cloud(cloud, turn, frame="camera"), scale)
         return None if plane is None else replace(plane, normal=plane.normal @ turn[:3, :3])
     xyz, inlier_m = cloud.xyz.astype(np.float64), scale * _INLIER_M

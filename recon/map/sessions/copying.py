@@ -87,7 +87,7 @@ def join_parts(
     for part_map, lead in parts:
         part, begin = part_map.session(), len(session) - lead
         if not len(session):
-            session.mount = part.mount
+            session.mount, session.level = part.mount, part.level
             session.set_axes(part.T_map_world, part.camera)
         detector = detector or LoopDetector(
             session.keyframes, part.camera, search=settings.loops.enabled, scale=settings.scale

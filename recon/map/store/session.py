@@ -17,6 +17,7 @@ from recon.io.files import reading
 from recon.look.rig import KnownRig, RefinedRig
 from recon.map.builders import Submap
 from recon.map.fusion import KNOWABLE, row_bytes
+from recon.map.ground.level import Level
 from recon.map.store.records import Store
 from recon.map.store.trees import (
     FRAMES,
@@ -74,7 +75,7 @@ class Session:
     """One drive in a map; the next commit of the map keeps what is added.
 
     ``mount`` is where the rectified left camera is on its robot, which is kept with the axes; None
-    = nothing says so.
+    = nothing says so. ``level`` is by what its axes are level.
     """
 
     def __init__(self, store: Store, number: int) -> None:
@@ -96,6 +97,7 @@ class Session:
             self.mount = value_in(Mount, axes["mount"]) if "mount" in axes else None
             if self.mount is not None:
                 check_rigid("T_base_camera", self.mount.T_base_camera)
+            self.level = value_in(Level, axes.get("level", {}))
             if sorted(self._times_s) != self._times_s:
                 raise FormatError("frames of the drive are not in order")
             for name in (OPTIMISED_POSES, POSES_BEFORE_LINKS):
@@ -196,8 +198,9 @@ class Session:
 
     def set_axes(self, T_map_world: Float64, camera: RectifiedCamera) -> None:
         content = {"T_map_world": T_map_world, "camera": asdict(camera)}
-        mounted = {} if self.mount is None else {"mount": asdict(self.mount)}
-        self._store.put(AXES, self.number, content | mounted)
+        if self.mount is not None:
+            content["mount"] = asdict(self.mount)
+        self._store.put(AXES, self.number, content | {"level": asdict(self.level)})
 
     @property
     def rig(self) -> KnownRig | None:
@@ -325,7 +328,7 @@ class Submaps:
         self.store.put(SUBMAP, key, tree_of(submap), compress=compress)
         content = asdict(entry).items()
         self.store.put(ENTRY, key, {name: value for name, value in content if value != ()})
-        self.entries.append(entry)
+        self.entries[submap.index : submap.index + 1] = [entry]
 
     def __getitem__(self, index: int) -> Submap:
         """Return a submap, read from the map: it is large, and used once."""
