@@ -27,6 +27,7 @@ from recon.core.values import (
 )
 from recon.core.values.arrays import Bool, Float32, Float64, UInt8, frozen_array
 from recon.stereo.rectify.lens import border_of, rays_of, rectifying_maps, sees_all
+from recon.stereo.rectify.noise import quieted
 
 # Allows for rounding in identity maps; far below the resolution of the interpolation (1/32 px).
 _BORDER_TOLERANCE_PX: Final = 1e-3
@@ -90,9 +91,10 @@ class Rectifier:
 
     def rectify(self, pair: Recorded) -> RectifiedPair:
         left, right = self.warp(pair)
+        grey_left, grey_right = quieted(to_grey(left), to_grey(right))
         return RectifiedPair(
-            left=to_grey(left),
-            right=to_grey(right),
+            left=grey_left,
+            right=grey_right,
             camera=self.camera,
             left_rgb=left if left.ndim == 3 else None,
             right_rgb=right if right.ndim == 3 else None,
