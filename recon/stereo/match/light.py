@@ -1,8 +1,8 @@
 """Light that differs between left and right, evened before they are compared.
 
-Gradients grow with light, and are what windows compare. What exposure, black level and curve of a
-sensor do depends on the grey level alone, what a vignette does is smooth in the image: where both
-images, made small, match, these are fitted.
+Gradients grow with light, and are what windows compare. What exposure and curve of a sensor do
+depends on the grey level alone, what a vignette does is smooth in the image: where both images,
+made small, match, these are fitted.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from recon.stereo.match.protocol import Matcher
 
 _LEAST_SIDE_PX: Final = 32  # of smaller images little is known
 _BLOCKS: Final = (4, 4)
-_ALIKE: Final = 0.05
-"""Difference of brightness (logarithm) that half of the blocks need: a fit is about as exact."""
+_ALIKE: Final = 0.1
+"""Difference of brightness (logarithm) that half of the blocks need: parallax alone makes half."""
 _FAIR: Final = 8, 247  # grey levels between which a ratio says something
 _MATCHING: Final = 0.05  # deviation of ratios (logarithm) where pixels match: surfaces shine
 _LEAST_MATCHES: Final = 200
-_ROUNDS: Final = 6
+_ROUNDS: Final = 4
 _RIDGE: Final = 0.01  # weight of no change, of that of all matches
 _MOST_CHANGE: Final = 1.5  # logarithm; where nothing matches a fit may lead anywhere
-_OF_LEVELS: Final = 3  # terms that depend on the grey level alone
+_OF_LEVELS: Final = 2  # terms that depend on the grey level alone
 _FIELD_PX: Final = 32  # sides of a field before it is enlarged
 
 Rough = Callable[[RectifiedPair], tuple[RectifiedPair, Float32]]
@@ -50,7 +50,7 @@ def even(pair: RectifiedPair, rough: Rough) -> RectifiedPair:
     if min(pair.left.shape) < _LEAST_SIDE_PX:
         return pair
     blocks = [
-        cv2.resize(image, _BLOCKS, interpolation=cv2.INTER_AREA).astype(np.float64)
+        cv2.resize(image[::4, ::4], _BLOCKS, interpolation=cv2.INTER_AREA).astype(np.float64)
         for image in (pair.left, pair.right)
     ]
     apart = np.abs(np.log((blocks[0] + 1.0) / (blocks[1] + 1.0)))
@@ -61,7 +61,7 @@ def even(pair: RectifiedPair, rough: Rough) -> RectifiedPair:
     if found is None:
         return pair
     # What is as bright matches better.
-    values = rough(replace(pair, right=relit(pair.right, found)))[1]
+    values = rough(replace(small, right=relit(small.right, found)))[1]
     again = fit_light(small, values)
     found = found if again is None else again
     rgb = None if pair.right_rgb is None else relit(pair.right_rgb, found)
@@ -69,7 +69,7 @@ def even(pair: RectifiedPair, rough: Rough) -> RectifiedPair:
 
 
 def fit_light(pair: RectifiedPair, values: Float32) -> Float64 | None:
-    """Return the weights (8,) of `_terms` of the right image that give log(left / right).
+    """Return the weights (7,) of `_terms` of the right image that give log(left / right).
 
     ``values`` is the disparity, NaN = none; None where too little matches.
     """
@@ -111,6 +111,6 @@ def _factor(weights: Float64, terms: Float64, some: slice) -> Float32:
 
 
 def _terms(levels: Float64, x: Float64, y: Float64) -> Float64:
-    """Return float64 (8, …): exposure, curve, black level, and a field, from -1 to 1."""
-    level = np.maximum(levels, 1.0) / 128.0
-    return np.stack([np.ones_like(x), np.log(level), 1 / level, x, y, x * x, x * y, y * y])
+    """Return float64 (7, …): exposure, curve, and a field, from -1 to 1."""
+    level = np.log(np.maximum(levels, 1.0) / 128.0)
+    return np.stack([np.ones_like(x), level, x, y, x * x, x * y, y * y])

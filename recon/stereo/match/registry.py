@@ -34,7 +34,7 @@ MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
     "onnx": lambda settings, threads: OnnxMatcher(settings.onnx, threads),
 }
 """What makes each matcher of its `MatchingSettings` and the number of threads."""
-_EVENED: Final = frozenset({"sad", "sgm", "fine"})  # OpenCV's are as they are
+EVENED: Final = frozenset({"sad", "sgm", "fine"})  # OpenCV's are as they are
 _NAMES: Final = ("matcher", "keyframe_matcher")  # the settings that name a matcher
 _RANGE: Final = frozenset({"ndisp", "min_disparity_px", "fill"})
 _WINDOW: Final = _RANGE | {"window_px", "uniqueness_percent"}
@@ -124,7 +124,7 @@ def make_matcher(
     made = MATCHERS[matcher](settings, threads)
     if "fill" in settings_taken(matcher) and _fills(matcher, settings):
         made = FillingMatcher(made, getattr(made, "reach_px", 0), threads)
-    if matcher in _EVENED:
+    if matcher in EVENED:
         made = EveningMatcher(made, match_small)
     # One that searches no range, or whose range is set, needs no guess.
     if settings.ndisp is not None or "ndisp" not in settings_taken(matcher):

@@ -37,7 +37,7 @@ def noise_sigma(grey: UInt8) -> float:
 
 def quieted(left: UInt8, right: UInt8) -> tuple[UInt8, UInt8]:
     """Smooth both images (H, W) where noise hides what they show, as at night."""
-    if min(noise_sigma(left), noise_sigma(right)) < _DROWNING:
+    if noise_sigma(left) < _DROWNING or noise_sigma(right) < _DROWNING:
         return left, right
     left, right = (cv2.GaussianBlur(image, (0, 0), _SMOOTH_PX) for image in (left, right))
     return left, right
