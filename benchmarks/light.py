@@ -47,13 +47,13 @@ def vignette(image: Float64) -> Float64:
 def slope(image: Float64) -> Float64:
     """From 0.6 at the left end to 1.4 at the right one."""
     x, _ = across(image)
-    return np.asarray(image * (1 + 0.4 * x / np.abs(x).max()))
+    return np.asarray(image * (1 + 0.4 * x / float(np.abs(x).max())))
 
 
 def spot(image: Float64) -> Float64:
     """Stray light in an upper corner: much of it is saturated."""
     x, y = across(image)
-    return image + 200 * np.exp(-((x + 0.4) ** 2 + (y + 0.3) ** 2) / (2 * 0.2**2))
+    return np.asarray(image + 200 * np.exp(-((x + 0.4) ** 2 + (y + 0.3) ** 2) / (2 * 0.2**2)))
 
 
 def dim(image: Float64) -> Float64:

@@ -20,7 +20,7 @@ from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, Int64, UInt8, tree_of
 from recon.core.values.camera import depth_from_disparity, project, unproject
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult, pose_in
-from recon.stereo.rectify.noise import LEAST_NOISE, noise_sigma
+from recon.stereo.rectify.rectifier import LEAST_NOISE, noise_sigma
 
 _MAX_SIGMA_M: Final = 0.05  # largest standard deviation of a trusted motion on a road
 _MAX_SIGMA_RATIO: Final = 0.05  # fraction of the motion's length that is added to it

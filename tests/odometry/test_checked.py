@@ -12,7 +12,7 @@ from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResul
 from recon.odometry.registry import make_odometry
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.match.registry import make_matcher
-from recon.stereo.rectify.noise import noise_sigma
+from recon.stereo.rectify.rectifier import noise_sigma
 from recon.street.settings import StreetScene
 from tests.odometry.conftest import STEP
 

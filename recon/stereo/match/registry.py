@@ -21,7 +21,7 @@ from recon.stereo.match.light import EveningMatcher
 from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.sad import AutoRangeMatcher, SadMatcher, estimate_ndisp, match_small
+from recon.stereo.match.sad import AutoRangeMatcher, SadMatcher, estimate_ndisp
 from recon.stereo.match.search import SearchSettings
 from recon.stereo.match.sgm import SgmMatcher
 
@@ -125,7 +125,7 @@ def make_matcher(
     if "fill" in settings_taken(matcher) and _fills(matcher, settings):
         made = FillingMatcher(made, getattr(made, "reach_px", 0), threads)
     if matcher in EVENED:
-        made = EveningMatcher(made, match_small)
+        made = EveningMatcher(made)
     # One that searches no range, or whose range is set, needs no guess.
     if settings.ndisp is not None or "ndisp" not in settings_taken(matcher):
         return made

@@ -207,9 +207,8 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     usual = common.usual_ndisp(width)
     if width < 6 or height < width // _COARSE_WIDTH_PX:
         return usual
-    small, values = match_small(pair)
-    factor = width // small.left.shape[1]
-    trusted = values[np.isfinite(values)]
+    values = match_small(pair)[1]
+    factor, trusted = width // values.shape[1], values[np.isfinite(values)]
     if trusted.size < _LEAST_MATCHES:
         return usual
     nearest_px = factor * (1.1 * float(np.percentile(trusted, _SHARE)) + 1.0)

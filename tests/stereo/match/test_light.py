@@ -9,7 +9,6 @@ from recon.core.values import RectifiedCamera, RectifiedPair
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.match.light import even, fit_light, relit
 from recon.stereo.match.registry import make_matcher
-from recon.stereo.match.sad import match_small
 from recon.stereo.rectify.rectifier import Rectifier
 from recon.street.settings import StreetScene
 
@@ -44,7 +43,7 @@ def darker(pair, light):
 
 def test_a_pair_in_one_light_is_left_as_it_is(street):
     pair, _ = street
-    assert even(pair, match_small) is pair
+    assert even(pair) is pair
 
 
 @pytest.mark.parametrize("name", LIGHTS)
@@ -52,8 +51,7 @@ def test_the_right_image_gets_the_light_of_the_left_one(street, name):
     pair, _ = street
     dark = darker(pair, LIGHTS[name])
     off, left = (
-        np.abs(np.log((each.right + 1.0) / (pair.right + 1.0)))
-        for each in (dark, even(dark, match_small))
+        np.abs(np.log((each.right + 1.0) / (pair.right + 1.0))) for each in (dark, even(dark))
     )
     # Surfaces shine and eight bits are coarse where it is dark; most of the change goes.
     assert np.median(left) < 0.3 * np.median(off)
@@ -74,7 +72,7 @@ def test_what_is_evened_matches_nearly_as_well(street, name):
 def test_colours_are_evened_too(street):
     pair, _ = street
     half = replace(pair, right=pair.right // 2, right_rgb=pair.right_rgb // 2)
-    seen = even(half, match_small)
+    seen = even(half)
     assert np.median(seen.right_rgb) == pytest.approx(np.median(pair.right_rgb), rel=0.1)
 
 
@@ -85,13 +83,13 @@ def test_plain_and_small_images_stay_as_they_are(shape):
         width_px=shape[1], height_px=shape[0],
     )  # fmt: skip
     pair = RectifiedPair(np.full(shape, 200, np.uint8), np.zeros(shape, np.uint8), camera)
-    assert even(pair, match_small) is pair
+    assert even(pair) is pair
 
 
 def test_images_that_do_not_belong_together_have_no_light_in_common(street):
     pair, _ = street
     noise = np.random.default_rng(0).integers(0, 90, pair.right.shape).astype(np.uint8)
-    seen = even(replace(pair, right=noise, right_rgb=None), match_small)
+    seen = even(replace(pair, right=noise, right_rgb=None))
     assert seen.right.std() <= 6 * noise.std()  # a factor is bounded
     assert fit_light(pair, np.full(pair.left.shape, np.nan, np.float32)) is None
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recon.stereo.rectify.noise import noise_sigma, quieted
+from recon.stereo.rectify.rectifier import noise_sigma, quieted
 
 
 def seen(sigma: float, seed: int) -> np.ndarray:
