@@ -13,6 +13,7 @@ import subprocess
 from pathlib import Path
 from typing import Any, Final
 
+import checkout  # noqa: F401 - what is measured
 from altered_drives import errors_of
 
 from recon.core.values import Trajectory
