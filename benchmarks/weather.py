@@ -175,7 +175,7 @@ def tunnel(shot: Shot) -> Seen:
     with np.errstate(divide="ignore", invalid="ignore"):
         enters = np.maximum((first - origin[0]) / rays[..., 0], 0.0)
         at = origin + enters[..., None] * rays
-        through = (np.abs(at[..., 1]) < WIDE_M) & (at[..., 2] < HIGH_M)
+        through = (np.abs(at[..., 1]) < WIDE_M) & (at[..., 2] < HIGH_M) & (at[..., 2] >= 0)
         planes = [((side * WIDE_M - origin[1]) / rays[..., 1]) for side in (-1, 1)]
         planes += [(high - origin[2]) / rays[..., 2] for high in (0.0, HIGH_M)]
     hits = np.stack([np.where(plane > enters + 1e-6, plane, np.inf) for plane in planes])
@@ -184,7 +184,7 @@ def tunnel(shot: Shot) -> Seen:
     ahead = origin[0] < last
     inside = through & (place[..., 0] > first) & (place[..., 0] < last) & ahead
     front = ~through & (origin[0] < first) & (enters < depth) & (np.abs(at[..., 1]) < 14)
-    front &= at[..., 2] < 9
+    front &= (at[..., 2] >= 0) & (at[..., 2] < 9)
     there = np.where(front[..., None], at, place)
     grain = 1 + 0.06 * concrete(there)
     grain *= np.where(np.abs(there[..., 0] % 5.0 - 2.5) < 0.02, 0.7, 1.0)
@@ -205,7 +205,7 @@ _GRAIN: Final = np.random.default_rng(5).normal(size=(512, 512)).astype(np.float
 
 def concrete(place: Float64) -> Float64:
     """Grain (H, W) of a deviation of about 1, at 5 cm and 60 cm, of places (H, W, 3) on walls."""
-    along, around = place[..., 0], place[..., 1] + place[..., 2]
+    along, around = place[..., 0] + 0.7 * place[..., 1], place[..., 1] + place[..., 2]
     total = np.zeros(along.shape)
     for size in (0.05, 0.6):
         maps = [np.asarray(each / size % 500, np.float32) for each in (along, around)]
