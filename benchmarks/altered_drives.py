@@ -344,16 +344,20 @@ def write_kitti(altered: Altered, folder: Path) -> None:
     for pair in altered.frames():
         for side, image in (("image_0", pair.left), ("image_1", pair.right)):
             write_image(folder / side / f"{pair.index:06d}.png", image)
-    camera = altered.calibration
+    write_calibration(altered.calibration, folder / "calib.txt")
+    np.savetxt(folder / "times.txt", altered.stamps_s, fmt="%.9e")
+    write_kitti_poses(folder / "poses.txt", altered.trajectory)
+
+
+def write_calibration(camera: RectifiedCamera, file: Path) -> None:
+    lines = []
     for number, (cx, shift) in enumerate(
         ((camera.cx_px, 0.0), (camera.cx_right_px, -camera.focal_px * camera.baseline_m))
     ):
         P = np.array([[camera.focal_px, 0, cx, shift], [0, camera.focal_px, camera.cy_px, 0]])
         rows = np.vstack([P, [0, 0, 1, 0]]).ravel()
-        with (folder / "calib.txt").open("a" if number else "w") as file:
-            file.write(f"P{number}: {' '.join(f'{value:.9e}' for value in rows)}\n")
-    np.savetxt(folder / "times.txt", altered.stamps_s, fmt="%.9e")
-    write_kitti_poses(folder / "poses.txt", altered.trajectory)
+        lines.append(f"P{number}: {' '.join(f'{value:.9e}' for value in rows)}\n")
+    file.write_text("".join(lines))
 
 
 def table(result: dict[str, dict[str, Any]]) -> str:

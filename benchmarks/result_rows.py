@@ -319,3 +319,65 @@ def scheduler(found: Found) -> Rows:
         }
         for row in found["sleeping"]["rows"]
     }
+
+
+def recordings(found: Found) -> Rows:
+    """What each recording gives, and what ORB-SLAM3 and COLMAP make of the same frames."""
+    rows: Rows = {}
+    for name, one in found["recordings"].items():
+        peers = {
+            head: one.get(key) for head, key in (("ORB-SLAM3", "orbslam3"), ("COLMAP", "colmap"))
+        }
+        refusal = one.get("product")
+        rows[f"{name}: {one['place']}"] = {
+            "camera": one.get("camera"),
+            "map": refusal or f"{one['frames']} frames, {one['length_m']:.1f} m",
+            "not trusted": one.get("lost"),
+            "ATE": centimetres(one),
+            "precision": one.get("precision"),
+            "recall": one.get("recall"),
+            "seconds": one.get("seconds"),
+            "ORB-SLAM3": None if refusal else peer_cell(peers["ORB-SLAM3"]),
+            "COLMAP": None if peers["COLMAP"] is None else centimetres(peers["COLMAP"]),
+        }
+    return rows
+
+
+def centimetres(one: Found) -> str | None:
+    """The error of a path."""
+    return None if one.get("ate_m") is None else f"{100 * one['ate_m']:.2g} cm"
+
+
+def peer_cell(one: Found | None) -> str:
+    """What a peer reached: its error, or how many frames it lost."""
+    if one is None:
+        return "not run"
+    lost = f"{one['lost']} lost" if "lost" in one else ""
+    return ", ".join(part for part in (centimetres(one), lost) if part)
+
+
+def weather(found: Found) -> Rows:
+    """Frames lost, the error of the path, and what is matched, beside ORB-SLAM3."""
+    return {
+        name: {
+            "frames": ours["frames"],
+            "lost": ours["lost"],
+            "ATE": 100 * ours["ate_m"],
+            "t_rel": ours["t_rel_percent"],
+            "matched": ours["valid_percent"],
+            "of it wrong": ours["wrong_percent"],
+            "ORB-SLAM3 lost": None if peer is None else peer["lost"],
+            "its ATE": 100 * peer["ate_m"] if peer and "ate_m" in peer else None,
+            "its t_rel": peer.get("t_rel_percent") if peer else None,
+        }
+        for name, both in found["street"].items()
+        for ours, peer in [(both["recon"], both["orbslam3"])]
+    }
+
+
+def light(found: Found) -> Rows:
+    """Bad 2 by what was done to the right image."""
+    return {
+        light: {f"`{matcher}`": bad for matcher, bad in one.items()}
+        for light, one in found["pairs"].items()
+    }

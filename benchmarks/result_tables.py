@@ -315,6 +315,29 @@ TABLES: Final[dict[str, Table]] = {
         },
         rows_of.degraded,
     ),
+    "recordings": Table(
+        {"recordings": "python benchmarks/recordings.py $RECON_DATA --json"},
+        dict.fromkeys(("camera", "map", "not trusted", "ATE"), "{}")
+        | {"precision": SHARE, "recall": SHARE, "seconds": "{:.0f}"}
+        | dict.fromkeys(("ORB-SLAM3", "COLMAP"), "{}"),
+        rows_of.recordings,
+        timed=True,
+    ),
+    "weather": Table(
+        {"street": "python benchmarks/weather.py --json"},
+        {"frames": "{}", "lost": "{}", "ATE": CM, "t_rel": PERCENT, "matched": "{:.0f} %"}
+        | {"of it wrong": "{:.0f} %", "ORB-SLAM3 lost": "{}", "its ATE": CM, "its t_rel": PERCENT},
+        rows_of.weather,
+    ),
+    "light": Table(
+        {
+            "pairs": "python benchmarks/light.py $RECON_DATA/middlebury/MiddEval3/trainingQ "
+            "--matcher sad,sgm,fine,opencv-sgbm --json"
+        },
+        dict.fromkeys(("`sad`", "`sgm`", "`fine`", "`opencv-sgbm`"), "{:.1f} %"),
+        rows_of.light,
+        scenes="MiddEval3",
+    ),
     "drift-intervals": Table(
         {"streets": "python benchmarks/drift_intervals.py --drives 40 --json"},
         {"drives": "{}", "segments within their 95 % interval": "{:.1f} %"}

@@ -17,7 +17,7 @@ from recon.look.sample import BLANK_DN, MIN_FEATURES, Gaps, Sample, measure_mosa
 from recon.look.settings import AuditedSettings, AuditSettings
 from recon.sources.settings import SourceSettings
 from recon.stereo.match.protocol import Matcher
-from recon.stereo.match.registry import MatchingSettings, settings_taken
+from recon.stereo.match.registry import EVENED, MatchingSettings, settings_taken
 
 Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
@@ -154,8 +154,8 @@ def _of_images(sample: Sample, matcher: str | Matcher) -> Found:
             yield "blur both", {"left": left, "right": right}
     gain, features = sample.gain
     if features >= MIN_FEATURES and not 1 / _GAIN < gain < _GAIN:
-        # The census transform of sgm compares grey levels only with their neighbours.
-        yield "gain", {"gain": gain, "other": "" if matcher == "sgm" else ", or match with sgm"}
+        evened = "; until then it is evened before matching" if matcher in EVENED else ""
+        yield "gain", {"gain": gain, "other": evened}
 
 
 def _blank_sides(sample: Sample) -> list[int]:

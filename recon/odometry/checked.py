@@ -20,6 +20,7 @@ from recon.core.values import Disparity, RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, Int64, UInt8, tree_of
 from recon.core.values.camera import depth_from_disparity, project, unproject
 from recon.odometry.protocol import Odometry, OdometryFrame, OdometryHealth, OdometryResult, pose_in
+from recon.stereo.rectify.rectifier import LEAST_NOISE, noise_sigma
 
 _MAX_SIGMA_M: Final = 0.05  # largest standard deviation of a trusted motion on a road
 _MAX_SIGMA_RATIO: Final = 0.05  # fraction of the motion's length that is added to it
@@ -94,7 +95,6 @@ def most_sigma_m(length_m: float, scale: float) -> float:
     return min(1.0, 2.5 * scale) * _MAX_SIGMA_M + _MAX_SIGMA_RATIO * length_m
 
 
-_LEAST_NOISE: Final = 0.5  # grey values: rounding alone leaves 0.3
 _STRIDE_PX: Final = 5  # every n-th row and column is sampled
 _PATCH_PX: Final = 48  # edge of a patch
 _MIN_PIXELS: Final = 24  # least number of samples with a disparity in a patch
@@ -158,24 +158,6 @@ def explain_motion(
     return Agreement(int(informative.sum()), float(agreeing.mean()))
 
 
-def noise_sigma(grey: UInt8) -> float:
-    """The standard deviation of the noise of an image, grey values.
-
-    From the median of mixed fourth differences, in which gradients and straight edges cancel.
-
-    Ref: Immerkær, "Fast noise variance estimation", CVIU 1996.
-    """
-    # Every fourth column and row: some ten thousand values give a median to one per cent.
-    columns = [grey[:, k : k + grey.shape[1] - 2 : 4].astype(np.int16) for k in range(3)]
-    across = columns[0] - 2 * columns[1] + columns[2]
-    rows = [across[k : k + len(across) - 2 : 4] for k in range(3)]
-    mixed = rows[0] - 2 * rows[1] + rows[2]
-    if not mixed.size:
-        return _LEAST_NOISE
-    # The weights' squares sum to 36; 0.6745 of a normal deviation is its median magnitude.
-    return max(float(np.median(np.abs(mixed))) / (6.0 * 0.6745), _LEAST_NOISE)
-
-
 def _sample(before: Sight, left: UInt8, T_before_now: Float64, camera: RectifiedCamera) -> _Samples:
     """Every n-th pixel with a disparity that stays in the image."""
     step, (height, width) = _STRIDE_PX, left.shape
@@ -225,7 +207,7 @@ def _correlation(samples: _Samples, count: Int64, noise: tuple[float, float]) ->
         _power(samples, values, count) - sigma**2
         for values, sigma in zip((one, other), noise, strict=True)
     )
-    floor = _LEAST_NOISE**2
+    floor = LEAST_NOISE**2
     return np.asarray(both / np.sqrt(np.maximum(power, floor) * np.maximum(power_other, floor)))
 
 

@@ -12,6 +12,7 @@ from recon.odometry.protocol import OdometryFrame, OdometryHealth, OdometryResul
 from recon.odometry.registry import make_odometry
 from recon.sources.synthetic import SyntheticSource
 from recon.stereo.match.registry import make_matcher
+from recon.stereo.rectify.rectifier import noise_sigma
 from recon.street.settings import StreetScene
 from tests.odometry.conftest import STEP
 
@@ -149,5 +150,5 @@ def test_the_noise_of_an_image_is_found(sigma):
     noisy = ramp + np.random.default_rng(3).normal(0.0, sigma, ramp.shape)
     grey = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
     # 15 000 values tell their median to 1 %; rounding and whole steps of the median add 0.3.
-    assert checked.noise_sigma(grey) == pytest.approx(sigma, rel=0.1, abs=0.3)
-    assert checked.noise_sigma(np.zeros((2, 2), np.uint8)) == 0.5  # the least
+    assert noise_sigma(grey) == pytest.approx(sigma, rel=0.1, abs=0.3)
+    assert noise_sigma(np.zeros((2, 2), np.uint8)) == 0.5  # the least

@@ -17,6 +17,7 @@ from recon.core.values import RectifiedPair
 from recon.stereo.match import protocol
 from recon.stereo.match.fill import FillingMatcher
 from recon.stereo.match.fine import FineMatcher
+from recon.stereo.match.light import EveningMatcher
 from recon.stereo.match.onnx import OnnxMatcher, OnnxSettings
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
@@ -33,6 +34,7 @@ MATCHERS: Final[dict[str, Callable[[Any, int | None], Matcher]]] = {
     "onnx": lambda settings, threads: OnnxMatcher(settings.onnx, threads),
 }
 """What makes each matcher of its `MatchingSettings` and the number of threads."""
+EVENED: Final = frozenset({"sad", "sgm", "fine"})  # OpenCV's are as they are
 _NAMES: Final = ("matcher", "keyframe_matcher")  # the settings that name a matcher
 _RANGE: Final = frozenset({"ndisp", "min_disparity_px", "fill"})
 _WINDOW: Final = _RANGE | {"window_px", "uniqueness_percent"}
@@ -122,6 +124,8 @@ def make_matcher(
     made = MATCHERS[matcher](settings, threads)
     if "fill" in settings_taken(matcher) and _fills(matcher, settings):
         made = FillingMatcher(made, getattr(made, "reach_px", 0), threads)
+    if matcher in EVENED:
+        made = EveningMatcher(made)
     # One that searches no range, or whose range is set, needs no guess.
     if settings.ndisp is not None or "ndisp" not in settings_taken(matcher):
         return made

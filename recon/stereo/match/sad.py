@@ -204,10 +204,22 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     `usual_ndisp`, also where too little can be trusted, and at most the image's width (rounded up).
     """
     height, width = pair.left.shape
-    factor = max(1, width // _COARSE_WIDTH_PX)
     usual = common.usual_ndisp(width)
-    if width // factor < 6 or height < factor:
+    if width < 6 or height < width // _COARSE_WIDTH_PX:
         return usual
+    values = match_small(pair)[1]
+    factor, trusted = width // values.shape[1], values[np.isfinite(values)]
+    if trusted.size < _LEAST_MATCHES:
+        return usual
+    nearest_px = factor * (1.1 * float(np.percentile(trusted, _SHARE)) + 1.0)
+    needed = min(nearest_px, width) - minimum_px + 1
+    return max(usual, _STEP * int(np.ceil(needed / _STEP)))
+
+
+def match_small(pair: RectifiedPair) -> tuple[RectifiedPair, Float32]:
+    """Match a pair at a small size; return it at that size, and what can be trusted, or NaN."""
+    height, width = pair.left.shape
+    factor = max(1, width // _COARSE_WIDTH_PX)
     size = width // factor, height // factor
     camera = replace(pair.camera.resized(*size), ndisp=size[0] // 2)
     wholes = (im[: size[1] * factor, : size[0] * factor] for im in (pair.left, pair.right))
@@ -215,12 +227,8 @@ def estimate_ndisp(pair: RectifiedPair, minimum_px: int = 0) -> int:
     small = RectifiedPair(np.asarray(left, np.uint8), np.asarray(right, np.uint8), camera)
     settings = common.SearchSettings(window_px=7, uniqueness_percent=10)
     found = SadMatcher(settings, threads=1, average=False).match(small)
-    trusted = found.values[found.valid & (found.confidence >= _CONFIDENCE)]
-    if trusted.size < _LEAST_MATCHES:
-        return usual
-    nearest_px = factor * (1.1 * float(np.percentile(trusted, _SHARE)) + 1.0)
-    needed = min(nearest_px, width) - minimum_px + 1
-    return max(usual, _STEP * int(np.ceil(needed / _STEP)))
+    sure = found.valid & (found.confidence >= _CONFIDENCE)
+    return small, np.where(sure, found.values, np.float32(np.nan))
 
 
 Number = TypeVar("Number", np.float32, np.uint8)

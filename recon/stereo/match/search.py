@@ -197,15 +197,15 @@ class _Lent:
         self._free.append(self._block)
 
 
-_GRADIENT_CAP: Final = 31  # plus or minus; Sobel units that windows compare at most
+GRADIENT_CAP: Final = 31  # plus or minus; Sobel units that windows compare at most
 _GAIN_OF_SOBEL: Final = 8.0  # a 3×3 Sobel filter answers a slope of one grey level per pixel with 8
 
 
 def clipped_gradients(image: UInt8, rows: range) -> UInt8:
     """Return what windows compare in N rows of an image: clipped Sobel gradients plus the cap."""
     gradients = _sobel(image, rows)
-    np.clip(gradients, -_GRADIENT_CAP, _GRADIENT_CAP, out=gradients)
-    gradients += _GRADIENT_CAP
+    np.clip(gradients, -GRADIENT_CAP, GRADIENT_CAP, out=gradients)
+    gradients += GRADIENT_CAP
     return gradients.astype(np.uint8)
 
 

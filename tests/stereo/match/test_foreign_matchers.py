@@ -11,6 +11,7 @@ from recon.commands.config import list_settings, load_config
 from recon.core.errors import MatchingError, SettingsError
 from recon.core.values import Disparity, Reason, RectifiedCamera, RectifiedPair
 from recon.io.middlebury import stand_in_camera
+from recon.stereo.match.light import EveningMatcher
 from recon.stereo.match.opencv import OpencvMatcher, OpencvSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import MATCHERS, MatchingSettings, make_matcher
@@ -174,7 +175,7 @@ def plugin(tmp_path, monkeypatch):
 def test_a_registered_matcher_has_a_name_that_is_not_ours_nor_of_two(tmp_path):
     assert np.nanmedian(recon.match(image(), image(), matcher="flat").values) == 7
     made = make_matcher("sad", MatchingSettings(ndisp=16))
-    assert type(made) is MATCHERS["sad"]
+    assert isinstance(made, EveningMatcher)
     with pytest.raises(SettingsError, match=r"unknown matcher.*'cencus'.*fails, fine, flat.*sad"):
         recon.match(image(), image(), matcher="cencus")
     install_plugin(tmp_path, "other-matcher", {}, {"flat": "other_matcher:Flat"})
