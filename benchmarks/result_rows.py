@@ -343,6 +343,21 @@ def recordings(found: Found) -> Rows:
     return rows
 
 
+def surfaces(found: Found) -> Rows:
+    """How much of what is seen at a depth a map has, and how much of it is right."""
+    return {
+        name: {
+            "points": one["points"],
+            "reach": one["reach_m"],
+            "precision": one["precision"],
+            "recall 0 to 2 m": one["recall 0 to 2 m"],
+            "2 to 4 m": one["recall 2 to 4 m"],
+            "4 to 6 m": one["recall 4 to 6 m"],
+        }
+        for name, one in found.items()
+    }
+
+
 def centimetres(one: Found) -> str | None:
     """The error of a path."""
     return None if one.get("ate_m") is None else f"{100 * one['ate_m']:.2g} cm"

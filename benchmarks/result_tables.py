@@ -323,6 +323,16 @@ TABLES: Final[dict[str, Table]] = {
         rows_of.recordings,
         timed=True,
     ),
+    "surfaces": Table(
+        {
+            "as it comes": "python benchmarks/surfaces.py $RECON_DATA/rendered/yard --json",
+            "`scene.scale=0.5`": "python benchmarks/surfaces.py $RECON_DATA/rendered/yard "
+            "--set scene.scale=0.5 --json",
+        },
+        {"points": "{:,}", "reach": "{:.1f} m", "precision": PERCENT}
+        | dict.fromkeys(("recall 0 to 2 m", "2 to 4 m", "4 to 6 m"), "{:.1f} %"),
+        rows_of.surfaces,
+    ),
     "weather": Table(
         {"street": "python benchmarks/weather.py --json"},
         {"frames": "{}", "lost": "{}", "ATE": CM, "t_rel": PERCENT, "matched": "{:.0f} %"}
