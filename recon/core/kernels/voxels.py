@@ -211,7 +211,8 @@ def _add_points(voxels: Arrays, points: Arrays, edge: float, frame: int, start: 
         x, y, z = xyz[n, 0] / edge, xyz[n, 1] / edge, xyz[n, 2] / edge
         i, j, k = math.floor(x), math.floor(y), math.floor(z)
         if len(doublings) and doublings[n]:
-            by, half = doublings[n], 1 << (doublings[n] - 1)
+            by = np.int64(doublings[n])
+            half = 1 << (by - 1)
             i, j, k = (i >> by << by) + half, (j >> by << by) + half, (k >> by << by) + half
         key = pack_key(i, j, k)
         row = find_or_add(table, key, rows)
