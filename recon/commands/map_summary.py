@@ -127,7 +127,7 @@ class MapSummary(RunSummary):
         return [
             (f"map of {counted(self.frames, 'frame')}{doubted}, {path}",),
             *([] if full else self.folder_row()),
-            ("maps", self._reach()),
+            ("maps", f"{self._reach()}, {self.made.grid.level.text}"),
             *made,
             *accuracy,
             *self.cost_row(*rate, *poses),

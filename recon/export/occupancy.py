@@ -74,7 +74,7 @@ class GridFigures(ProductFigures):
     @property
     def text(self) -> str:
         sides = (metres(cells * self.resolution_m) for cells in (self.columns, self.rows))
-        return f"{' × '.join(sides)}, cells of {self.resolution_m:g} m, {self.level.text}"
+        return f"{' × '.join(sides)}, cells of {self.resolution_m:g} m"
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,7 @@ from recon.export.mesh.pieces import MeshFigures
 from recon.export.occupancy import GridFigures, OctomapFigures
 from recon.export.product import PointFigures
 from recon.look.rig import RigFigures
+from recon.map.ground.level import Level
 from recon.map.localize.sequence import FrameSeconds, LocalizedFigures, LocalizeSummary
 from recon.map.sessions.georeference import SurveyFigures
 from recon.rig.audit import AuditFigures, AuditSummary, CorrectedFigures, Correction, FindingFigures
@@ -92,7 +93,7 @@ PAIR = PairSummary(
 )  # fmt: skip
 GRID = GridFigures(
     resolution_m=0.2, rows=5900, columns=2700, occupied_cells=1, free_cells=1,
-    camera_height_m=1.65, T_base_camera=np.eye(4),
+    camera_height_m=1.65, T_base_camera=np.eye(4), level=Level("surfaces", 1.2),
 )  # fmt: skip
 MADE = UsualProducts(
     cloud=CloudFigures(12_345_678, 1234),
@@ -231,7 +232,8 @@ SUMMARIES: dict[str, Summary] = {
     ),
     "capture": CAPTURED,
     "board": BoardSummary(
-        board="chess:9x6:25mm", square_mm=25.0, pattern_width_mm=250.0, pattern_height_mm=175.0,
+        board="chess:9x6:25mm", square_mm=25.0, measured="squares of 25 mm",
+        pattern_width_mm=250.0, pattern_height_mm=175.0,
         paper="a4", paper_width_mm=297.0, paper_height_mm=210.0, file="board.pdf",
     ),
     "evaluate trajectory": TrajectoryEvaluation(

@@ -46,9 +46,10 @@ class Level:
     @property
     def text(self) -> str:
         if self.by == NOT_KNOWN:
-            return "what is up is not known"
-        known = "" if math.isnan(self.sigma_deg) else f" to {self.sigma_deg:.1f}°"
-        return f"level{known} by {self.by}"
+            return "level not known"
+        return "level " + (
+            f"by {self.by}" if math.isnan(self.sigma_deg) else f"to {self.sigma_deg:.1f}°"
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
