@@ -119,7 +119,8 @@ def _read_camera(fields: Fields) -> CameraIntrinsics:
     return CameraIntrinsics(pinhole_matrix(fx, fy, cx, cy), distortion, *size, model)
 
 
-_COMMA, _POINT = re.compile(r"\d,\d"), re.compile(r"^[^%<\n]*\d\.", re.MULTILINE)
+_COMMA = re.compile(r"\d,\d")
+_POINT = re.compile(r"^[^%<\n]*\d(?:\.|,\d+,\d)", re.MULTILINE)  # or a list of whole numbers
 #: What a text of a format contains that has other rules than names and shapes. Files of OpenCV may
 #: contain a ``P1:``, too: KITTI's comes after them.
 _SIGNS: Final = {

@@ -86,6 +86,8 @@ def read_named(
     form, unit_m = next(
         form for sign, form in _TABLES["forms"].items() if any(re.match(sign, key) for key in keys)
     )
+    units = next((str(value) for key, value in contents.items() if "WorldUnits" in key), "")
+    unit_m = _TABLES["units"].get(units, unit_m)
     if "ZED" in form:
         contents, size_px = _of_resolution(contents, size_px, path)
     if "OAK" in form:
@@ -396,8 +398,9 @@ def _check_unit(baseline_m: float) -> None:
 def _rigid(pose: Float64) -> Float64:
     """Return a pose (4, 4) of sixteen numbers, or of a position and a quaternion."""
     values = pose.ravel()
-    if values.size == 16:
-        T = make_transform(values.reshape(4, 4)[:3, :3], values.reshape(4, 4)[:3, 3])
+    if values.size in (12, 16):
+        rows = values.reshape(-1, 4)
+        T = make_transform(rows[:3, :3], rows[:3, 3])
         check_rotation(T[:3, :3], "rotation of a pose")
         return T
     length = np.linalg.norm(values[3:])
