@@ -53,7 +53,9 @@ _SIDES: Final = (("left", "right"), ("l", "r"), ("0", "1"), ("1", "2"))
 _WORD: Final = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _GLUED: Final = re.compile(r"([KDMPkdmp]|mtx|dist)([LRlr])")  # ``mtxl``, ``KL``: name and side
 _OTHERS: Final = re.compile(  # matrices that have been called as those that are looked for
-    r"new|optimal|rect|fundamental|essential|homography|error|std|uncertainty|roi|distorted", re.I
+    r"new|optimal|rect(?!ification_matrix)|fundamental|essential|homography|error|std|uncertainty|"
+    r"roi|distorted",
+    re.I,
 )
 _TABLES: Final = read_toml(Path(__file__).with_name("names.toml"))
 _FIELDS: Final = {k: (v[0].split(), frozenset(v[1:])) for k, v in _TABLES["fields"].items()}
@@ -120,6 +122,10 @@ def _with_others(path: Path, contents: Contents) -> Contents:
     if all(named) or (path in pair and all(each.is_file() for each in pair)):
         for side, each in zip(_BOTH, pair, strict=True):
             contents |= {f"{side}.{key}": value for key, value in read_contents(each).items()}
+    elif "projection_matrix" in contents:
+        missing = next((each for each in pair if not each.is_file()), pair[1])
+        hint = "give both files the same name but for 'left' and 'right'"
+        raise FormatError("CameraInfo of the other camera is missing", where=missing, hint=hint)
     return contents
 
 
@@ -209,7 +215,7 @@ class _Named:
         if turns[0] is None or turns[1] is None or projections is None:
             return self._rectified(*cameras)
         both = (cameras[0], turns[0].reshape(3, 3)), (cameras[1], turns[1].reshape(3, 3))
-        return rig_of_camera_infos(*both, projections, self._where)
+        return rig_of_camera_infos(*both, projections, self._where, size_px)
 
     def matrix(self, side: Side) -> Float64 | None:
         """Return the camera matrix (3, 3) of a side, pixel centres at integers; None = none."""
