@@ -18,6 +18,7 @@ from recon.core.geometry.se3 import exp_so3, invert, make_transform, rotation_fr
 from recon.core.text import counted
 from recon.core.values import (
     LENS_COEFFICIENTS,
+    PINHOLE_COUNTS,
     CameraIntrinsics,
     LensModel,
     RectifiedCamera,
@@ -31,7 +32,6 @@ from recon.core.values.arrays import Float64
 from recon.io.cameras.contents import SAVE, Contents, Value, read_contents
 from recon.io.cameras.kitti import projected_rig
 from recon.io.cameras.ros import (
-    AGAIN,
     camera_info_paths,
     in_options,
     pinhole_matrix,
@@ -64,7 +64,6 @@ _LENS_OF: Final[dict[str, LensModel]] = {
 }
 _WHOLE: Final = frozenset(_TABLES["words"]["whole"].split())
 _OF_CAMERAS: Final = frozenset(name for field in "KDP" for name in _FIELDS[field][0])
-_PINHOLE_COUNTS: Final = (0, 4, 5, 8, 12, 14)  # coefficients that OpenCV supports
 # OpenCV names no lens model, and both have four coefficients. A pinhole that sees more than 90
 # degrees has a distortion above this; a fisheye's polynomial is close to 1.
 _FISHEYE_LIKE: Final = 0.1
@@ -99,6 +98,16 @@ def read_named(
     if metres_per_unit is None and rig is not None:
         _check_unit(rig.baseline_m)
     return rig
+
+
+def lens_called(name: str) -> LensModel:
+    """Return our lens model by what any program calls it."""
+    lens = _LENS_OF.get(re.sub(r"[^a-z0-9]", "", name.lower()))
+    if lens is None:
+        what, hint = "lens model is not supported", "calibrate again with one of these; fisheye is "
+        expected, hint = ", ".join(LENS_COEFFICIENTS), f"{hint}for wide lenses"
+        raise FormatError(what, got=name, expected=expected, hint=hint)
+    return lens
 
 
 @reader
@@ -292,12 +301,7 @@ class _Named:
 
     def _lens(self, side: Side) -> LensModel | None:
         """Return the lens model that a file names: if it names two, the one that is no pinhole."""
-        models, expected = self._models(side), ", ".join(LENS_COEFFICIENTS)
-        for name in models:
-            if name not in _LENS_OF:
-                what = "lens model is not supported"
-                raise FormatError(what, got=name, expected=expected, hint=AGAIN)
-        lenses = sorted((_LENS_OF[name] for name in models), key="pinhole".__eq__)
+        lenses = sorted(map(lens_called, self._models(side)), key="pinhole".__eq__)
         return lenses[0] if lenses else None
 
     def _distortion(self, side: Side, lens: LensModel) -> Float64:
@@ -312,13 +316,12 @@ class _Named:
             names = LENS_COEFFICIENTS[lens][head.size : 12]  # a tilted sensor's are in no file
             given = np.array([self.number(name, side, "") or 0.0 for name in names])
             if lens == "pinhole":
-                given = given[: next(n for n in _PINHOLE_COUNTS if not given[n:].any())]
+                given = given[: next(n for n in PINHOLE_COUNTS if not given[n:].any())]
         most = len(LENS_COEFFICIENTS[lens]) - head.size
         if given is not None and not given.ravel()[most:].any():  # padded, as OAK's are
             given = given.ravel()[:most]
-        count = head.size + (sizes[0] if given is None else given.size)
-        if given is None or (lens == "pinhole" and count not in _PINHOLE_COUNTS):
-            what, got = "distortion has the wrong size", counted(count, "coefficient")
+        if given is None:
+            what, got = "distortion has the wrong size", counted(sizes[0], "coefficient")
             raise FormatError(what, got=got, expected="4, 5, 8, 12 or 14")
         if given.any() and "none" in self._models(side):
             raise FormatError("a lens without distortion has coefficients", got=given.tolist())

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from recon.core.errors import CalibrationError, FormatError
+from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import make_transform, orthonormalise, rotation_from_quaternion
 from recon.core.text import counted
 from recon.core.values import (
@@ -45,7 +45,6 @@ _KALIBR_MODELS: Final[Models] = {
     "none": ("pinhole", (0,)),
 }
 NS: Final = 1e-9
-AGAIN: Final = "calibrate again with one of these; equidistant is for wide lenses"
 _SIDES: Final = ("left", "right")
 _OFF_CENTRE: Final = 0.05  # of a principal point, in image sizes: hardly a lens is mounted worse
 
@@ -203,22 +202,6 @@ def in_options(focal_px: float, baseline_m: float, cx_px: float, cy_px: float) -
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64:
     """Return float64 (3, 3) camera matrix, pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def lens_of(
-    models: Models, name: str, coefficients: Float64, where: StrPath
-) -> tuple[LensModel, Float64]:
-    """Return our lens model for a format's name, and its coefficients."""
-    if name not in models:
-        expected = ", ".join(models)
-        what = "lens model is not supported"
-        raise FormatError(what, where=where, got=name, expected=expected, hint=AGAIN)
-    model, counts = models[name]
-    if coefficients.size not in counts:
-        what = f"lens model {name!r} has the wrong number of coefficients"
-        expected = " or ".join(str(count) for count in counts)
-        raise FormatError(what, where=where, got=coefficients.size, expected=expected)
-    return model, coefficients
 
 
 def _name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str, Float64]:

@@ -501,6 +501,13 @@ def test_lists_of_whole_numbers_have_no_decimal_commas(tmp_path):
         read_calibration(tmp_path / "c.json", *SIZE)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 15])
+def test_no_lens_has_coefficients_that_opencv_cannot_take(count):
+    K = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
+    with pytest.raises(CalibrationError, match="distortion has the wrong size"):
+        CameraIntrinsics(K, np.zeros(count), *SIZE)
+
+
 def test_a_pose_may_have_three_rows(tmp_path):
     K = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
     T = make_transform(np.eye(3), np.array([-0.1, 0, 0]))
