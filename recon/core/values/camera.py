@@ -78,8 +78,8 @@ class CameraIntrinsics:
             raise CalibrationError("distortion is implausible", got=self.distortion.tolist())
         names = LENS_COEFFICIENTS[self.model]
         if self.model == "pinhole" and self.distortion.size not in PINHOLE_COUNTS:
-            what, got = "distortion has the wrong size", f"{self.distortion.size} coefficients"
-            raise CalibrationError(what, got=got, expected="4, 5, 8, 12 or 14")
+            what, expected = "distortion has the wrong size", "4, 5, 8, 12 or 14 coefficients"
+            raise CalibrationError(what, got=self.distortion.size, expected=expected)
         if self.model != "pinhole" and self.distortion.size != len(names):
             what = f"the lens model {self.model} has other coefficients"
             raise CalibrationError(what, got=self.distortion.size, expected=" ".join(names))
