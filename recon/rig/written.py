@@ -12,8 +12,7 @@ import numpy as np
 
 from recon.core.errors import SettingsError
 from recon.core.values import CameraIntrinsics, Rig
-from recon.io.cameras.calibration import write_recon_calibration
-from recon.io.cameras.opencv_yaml import write_opencv_calibration
+from recon.io.cameras.calibration import write_opencv_calibration, write_recon_calibration
 from recon.io.cameras.ros import camera_info_paths, write_camera_info, write_kalibr
 from recon.look.fault import spread_pixels
 from recon.stereo.rectify.epipolar import as_raw

@@ -154,7 +154,10 @@ def pair_stamps(
 
     Returns frames in order of time: the indices of left and right image, None = missing.
     """
-    to_right, to_left = nearest_sorted(left_s, right_s), nearest_sorted(right_s, left_s)
+    # Of two that are as near, a left image takes the first and a right one the last: else cameras
+    # half a period apart would hardly have a pair.
+    to_right = nearest_sorted(left_s, right_s)
+    to_left = len(left_s) - 1 - nearest_sorted(-right_s, -left_s[::-1])
     mutual = to_left[to_right] == np.arange(len(left_s))
     apart_s = np.abs(right_s[to_right] - left_s)
     paired = mutual & (apart_s <= tolerance_s)

@@ -14,13 +14,8 @@ from recon.core.geometry.se3 import invert, make_transform, orthonormalise
 from recon.core.values import CameraIntrinsics, Rig, StereoCalibration, check_side_by_side
 from recon.core.values.arrays import Float64
 from recon.io.cameras.kitti import projected_rig
-from recon.io.cameras.ros import (
-    ROS_MODELS,
-    are_rectified,
-    lens_of,
-    rig_of_camera_infos,
-    step_between,
-)
+from recon.io.cameras.named import lens_called
+from recon.io.cameras.ros import are_rectified, rig_of_camera_infos, step_between
 from recon.io.files import StrPath, reading
 from recon.io.ros.contents import CAMERA_INFO, COMPRESSED, IMAGE, IMU, VIDEOS, BagCameraInfo
 from recon.sources.calibration import CALIBRATE, as_rectified
@@ -203,11 +198,10 @@ def _rig_between(
 
 
 def _camera(info: BagCameraInfo, where: StrPath) -> CameraIntrinsics:
-    # Drivers of rectified images may leave the model empty.
-    name = info.model or "plumb_bob"
-    model, distortion = lens_of(ROS_MODELS, name, np.asarray(info.D), where)
     with reading(where):
-        return CameraIntrinsics(info.K, distortion, info.width_px, info.height_px, model)
+        # Drivers of rectified images may leave the model empty.
+        model = lens_called(info.model or "plumb_bob")
+        return CameraIntrinsics(info.K, info.D, info.width_px, info.height_px, model)
 
 
 def find_imu(topics: Topics) -> str | None:

@@ -221,7 +221,7 @@ def test_a_setting_at_its_bound_gives_a_map_or_one_line(number, end, street, tmp
             with Run("map", tmp_path / "out", config) as made:
                 mapped = map_sequence(street, config)
                 context = ExportContext(mapped.map, mapped.placed, made, config.mesh)
-                make(context, ("cloud", "octomap", "grid"))
+                make(context, made.content, ("cloud", "octomap", "grid"))
         except ReconError as error:
             line = str(error)
     assert "\n" not in line

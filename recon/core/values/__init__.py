@@ -5,6 +5,7 @@ What a notebook shows of them is made by layers above, on demand (`recon.core.la
 
 from recon.core.values.camera import LARGEST_CENTRE_OFFSET as LARGEST_CENTRE_OFFSET
 from recon.core.values.camera import LENS_COEFFICIENTS as LENS_COEFFICIENTS
+from recon.core.values.camera import PINHOLE_COUNTS as PINHOLE_COUNTS
 from recon.core.values.camera import CameraIntrinsics as CameraIntrinsics
 from recon.core.values.camera import LensModel as LensModel
 from recon.core.values.camera import RectifiedCamera as RectifiedCamera

@@ -28,6 +28,7 @@ LENS_COEFFICIENTS: Final[dict[LensModel, tuple[str, ...]]] = {
     "fov": ("w",),
     "omni": ("xi", "k1", "k2", "p1", "p2"),
 }  # fmt: skip
+PINHOLE_COUNTS: Final = (0, 4, 5, 8, 12, 14)  # of coefficients that OpenCV supports
 _WITHIN: Final[dict[LensModel, tuple[tuple[float, float], ...]]] = {  # of the first coefficients
     "ds": ((-1.0, 1.0), (0.0, 1.0)),
     "eucm": ((0.0, 1.0), (1e-3, 1e3)),
@@ -76,6 +77,9 @@ class CameraIntrinsics:
         if np.abs(self.distortion).max(initial=0.0) > _MOST_DISTORTION:
             raise CalibrationError("distortion is implausible", got=self.distortion.tolist())
         names = LENS_COEFFICIENTS[self.model]
+        if self.model == "pinhole" and self.distortion.size not in PINHOLE_COUNTS:
+            what, expected = "distortion has the wrong size", "4, 5, 8, 12 or 14 coefficients"
+            raise CalibrationError(what, got=self.distortion.size, expected=expected)
         if self.model != "pinhole" and self.distortion.size != len(names):
             what = f"the lens model {self.model} has other coefficients"
             raise CalibrationError(what, got=self.distortion.size, expected=" ".join(names))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, cast
 
+import cv2
 import numpy as np
 import yaml
 
@@ -26,7 +27,7 @@ from recon.io.atomic import write_text
 from recon.io.cameras.contents import BINARY
 from recon.io.cameras.kitti import COLOUR_CAMERAS, GREY_CAMERAS, list_kitti_cameras, read_kitti_rig
 from recon.io.cameras.named import INSTEAD, read_named
-from recon.io.cameras.ros import pinhole_matrix, read_camera_info
+from recon.io.cameras.ros import pinhole_matrix
 from recon.io.fields import Fields, read_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text, reader
 from recon.io.middlebury import read_middlebury_calib
@@ -49,6 +50,29 @@ def write_recon_calibration(
         content["quality"] = dict(quality)
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None)
     write_text(path, _HEADER + text)
+
+
+def write_opencv_calibration(path: StrPath, calibration: StereoCalibration) -> None:
+    """Write one file for OpenCV's ``FileStorage``: XML or JSON where it is named so, else YAML."""
+    models = {calibration.left.model, calibration.right.model}
+    if len(models) > 1:
+        raise CalibrationError("an OpenCV file cannot store two lens models", where=path)
+    if models - {"pinhole", "fisheye"}:
+        what = "an OpenCV file cannot store this lens model"
+        raise CalibrationError(what, where=path, got=calibration.left.model)
+    suffix = Path(path).suffix.lower()
+    kind = suffix if suffix in {".xml", ".json"} else ".yml"
+    storage = cv2.FileStorage(kind, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+    storage.write("image_width", calibration.left.width_px)
+    storage.write("image_height", calibration.left.height_px)
+    if "fisheye" in models:
+        storage.write("distortion_model", "fisheye")
+    for number, camera in enumerate((calibration.left, calibration.right), start=1):
+        storage.write(f"M{number}", np.array(camera.matrix))
+        storage.write(f"D{number}", np.array(camera.distortion).reshape(1, -1))
+    storage.write("R", np.array(calibration.T_right_left[:3, :3]))
+    storage.write("T", np.array(calibration.T_right_left[:3, 3]).reshape(3, 1))
+    write_text(path, storage.releaseAndGetString())
 
 
 @reader
@@ -119,12 +143,12 @@ def _read_camera(fields: Fields) -> CameraIntrinsics:
     return CameraIntrinsics(pinhole_matrix(fx, fy, cx, cy), distortion, *size, model)
 
 
-_COMMA, _POINT = re.compile(r"\d,\d"), re.compile(r"^[^%<\n]*\d\.", re.MULTILINE)
+_COMMA = re.compile(r"\d,\d")
+_POINT = re.compile(r"^[^%<\n]*\d(?:\.|,\d+,\d)", re.MULTILINE)  # or a list of whole numbers
 #: What a text of a format contains that has other rules than names and shapes. Files of OpenCV may
 #: contain a ``P1:``, too: KITTI's comes after them.
 _SIGNS: Final = {
     "recon": re.compile(rf"^format:\s*{MARK}", re.MULTILINE),
-    "ros": re.compile(r"^projection_matrix:", re.MULTILINE),
     "": re.compile(r"^%YAML|<opencv_storage>|opencv-matrix"),
     "middlebury": re.compile(r"^\s*cam[01]\s*=", re.MULTILINE),
     "kitti": re.compile(r"^P(?:_rect_0)?\d:", re.MULTILINE | re.ASCII),
@@ -162,8 +186,6 @@ def read_calibration(
     form = _form(path)
     if form == "kitti":
         rig: Rig | None = _read_kitti(path, size, cameras)
-    elif form == "ros":
-        rig = read_camera_info(path, size)
     elif form in _READERS:
         rig = _READERS[form](path)
     else:

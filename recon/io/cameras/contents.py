@@ -7,7 +7,6 @@ another is dotted: ``left.projection.fx``.
 from __future__ import annotations
 
 import configparser
-import io
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -44,6 +43,12 @@ _REFUSED: Final = {  # by how a file begins
     b"\x93NUMPY": "one array of NumPy is no calibration of a pair",
 }
 _XML_ROOT: Final = "opencv_storage"
+# Of MATLAB's files: kinds of elements and variables, and the most bytes of what is compressed.
+_COMPRESSED, _STRUCTURE, _CHARACTERS, _OBJECT, _MOST_OF_MATLAB = 15, 2, 4, 17, 1 << 24
+_NUMBERS: Final = {
+    1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8",
+    13: "<u8", 16: "u1", 17: "<u2",
+}  # fmt: skip
 _MOST_BYTES: Final = 1 << 20  # of an array: more than a matrix has, less than tables of a remap
 _VECTORS: Final = {frozenset(names): names for names in (
     ("x", "y", "z"), ("x", "y", "z", "w"), ("px", "py", "pz", "qx", "qy", "qz", "qw"),
@@ -63,7 +68,7 @@ def read_contents(path: StrPath) -> Contents:
     if head.startswith(b"PK\x03\x04"):
         return dict(_flat(_read_arrays(path)))
     if head.startswith(b"MATLAB"):
-        return dict(_flat(_read_matlab(read_bytes(path, SMALL_FILE_BYTES))))
+        return dict(_flat(dict(_read_matlab(read_bytes(path, SMALL_FILE_BYTES)))))
     refused = [what for sign, what in _REFUSED.items() if head.startswith(sign)]
     if refused or Path(path).suffix in BINARY[:3]:
         raise FormatError((*refused, _PICKLE)[0], hint=f"load it where it was written, and {SAVE}")
@@ -117,36 +122,74 @@ def _read_arrays(path: StrPath) -> dict[str, Any]:
                 if "allow_pickle" not in str(error):
                     raise
     if not arrays:
-        what = "archive has no arrays of numbers, but pickled objects or none"
+        what = "archive has no matrices of cameras, but pickled objects, large tables or nothing"
         raise FormatError(what, expected="matrices K1, D1, K2, D2, R, T", hint=SAVE)
     return arrays
 
 
-def _read_matlab(content: bytes) -> dict[str, Any]:
-    from scipy.io import loadmat  # noqa: PLC0415 - slow, and for these files alone
-    from scipy.io.matlab import MatlabOpaque  # noqa: PLC0415
+def _read_matlab(content: bytes) -> Iterator[tuple[str, Any]]:
+    """Yield names and values of variables; SciPy's reader of damaged files ends the process.
 
-    if not content.startswith(b"MATLAB 5.0"):
+    Ref: "MAT-File Format", MathWorks, level 5.
+    """
+    if not content.startswith(b"MATLAB 5.0") or content[126:128] != b"IM":
         what, got = "this version of MATLAB's files is not read", content[:19].decode("latin-1")
-        raise FormatError(
-            what, got=got, hint="in MATLAB: save('stereo.mat', '-struct', 'p', '-v7')"
-        )
-    at = 128
-    while at + 8 <= len(content):  # a compressed variable must not become more than a file may have
-        kind, size = np.frombuffer(content, "<u4", 2, at).tolist()
-        if kind == 15:
+        hint = "in MATLAB: save('stereo.mat', '-struct', 'p', '-v7')"
+        raise FormatError(what, got=got, hint=hint)
+    left = _MOST_OF_MATLAB
+    for kind, part in _elements(memoryview(content)[128:]):
+        if kind == _COMPRESSED:
             unpack = zlib.decompressobj()
-            unpack.decompress(content[at + 8 : at + 8 + size], SMALL_FILE_BYTES)
-            if unpack.unconsumed_tail:
+            inside = memoryview(unpack.decompress(part, left))
+            left -= len(inside)
+            if unpack.unconsumed_tail or left < 1:
                 raise FormatError("a variable is too large for a calibration")
-        at += 8 + size
-    values = loadmat(io.BytesIO(content), simplify_cells=True)
-    if any(isinstance(value, MatlabOpaque) for value in values.values()):
+            yield from (_variable(each) for _, each in _elements(inside))
+        else:
+            yield _variable(part)
+
+
+def _elements(content: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """Yield kind and data of elements that follow each other."""
+    at = 0
+    while at + 8 <= len(content):
+        kind, size = np.frombuffer(content, "<u4", 2, at).tolist()
+        start = at + 8
+        if kind >> 16:  # a short one is where others have their size
+            kind, size, start = kind & 0xFFFF, kind >> 16, at + 4
+        if start + size > len(content):
+            raise FormatError("MATLAB file is truncated or damaged", hint="copy the file again")
+        yield kind, content[start : start + size]
+        at = start + size + (0 if kind == _COMPRESSED else -(start + size) % 8)
+
+
+def _variable(content: memoryview) -> tuple[str, Any]:
+    """Return name and value of a variable: a structure, a text, or numbers; None = another."""
+    (_, flags), *parts = _elements(content)
+    if flags[0] == _OBJECT:
         raise FormatError(
             "an object of MATLAB can be read by MATLAB alone",
             hint="in MATLAB: p = toStruct(stereoParams); save('stereo.mat', '-struct', 'p', '-v7')",
         )
-    return {name: value for name, value in values.items() if not name.startswith("__")}
+    (_, shape), (_, name), *values = parts
+    value: Any = None
+    if flags[0] == _STRUCTURE:  # of several the first
+        (_, longest), (_, names), *fields = values
+        width = int.from_bytes(longest, "little")
+        starts = range(0, len(names), width)
+        keys = [_text(names[at : at + width]) for at in starts]
+        value = {key: _variable(field)[1] for key, (_, field) in zip(keys, fields, strict=False)}
+    elif values and (kind := _NUMBERS.get(values[0][0])):
+        numbers = np.frombuffer(values[0][1], kind)
+        sides = np.frombuffer(shape, "<i4")
+        value = numbers.reshape(sides, order="F").squeeze()
+        if flags[0] == _CHARACTERS:
+            value = "".join(map(chr, numbers.tolist()))
+    return _text(name), value
+
+
+def _text(content: memoryview) -> str:
+    return bytes(content).partition(b"\0")[0].decode("latin-1")
 
 
 def _flat(node: Any, name: str = "") -> Iterator[tuple[str, Value]]:

@@ -18,6 +18,7 @@ from recon.core.geometry.se3 import exp_so3, invert, make_transform, rotation_fr
 from recon.core.text import counted
 from recon.core.values import (
     LENS_COEFFICIENTS,
+    PINHOLE_COUNTS,
     CameraIntrinsics,
     LensModel,
     RectifiedCamera,
@@ -31,7 +32,6 @@ from recon.core.values.arrays import Float64
 from recon.io.cameras.contents import SAVE, Contents, Value, read_contents
 from recon.io.cameras.kitti import projected_rig
 from recon.io.cameras.ros import (
-    AGAIN,
     camera_info_paths,
     in_options,
     pinhole_matrix,
@@ -53,7 +53,9 @@ _SIDES: Final = (("left", "right"), ("l", "r"), ("0", "1"), ("1", "2"))
 _WORD: Final = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 _GLUED: Final = re.compile(r"([KDMPkdmp]|mtx|dist)([LRlr])")  # ``mtxl``, ``KL``: name and side
 _OTHERS: Final = re.compile(  # matrices that have been called as those that are looked for
-    r"new|optimal|rect|fundamental|essential|homography|error|std|uncertainty|roi|distorted", re.I
+    r"new|optimal|rect(?!ification_matrix)|fundamental|essential|homography|error|std|uncertainty|"
+    r"roi|distorted",
+    re.I,
 )
 _TABLES: Final = read_toml(Path(__file__).with_name("names.toml"))
 _FIELDS: Final = {k: (v[0].split(), frozenset(v[1:])) for k, v in _TABLES["fields"].items()}
@@ -62,7 +64,6 @@ _LENS_OF: Final[dict[str, LensModel]] = {
 }
 _WHOLE: Final = frozenset(_TABLES["words"]["whole"].split())
 _OF_CAMERAS: Final = frozenset(name for field in "KDP" for name in _FIELDS[field][0])
-_PINHOLE_COUNTS: Final = (0, 4, 5, 8, 12, 14)  # coefficients that OpenCV supports
 # OpenCV names no lens model, and both have four coefficients. A pinhole that sees more than 90
 # degrees has a distortion above this; a fisheye's polynomial is close to 1.
 _FISHEYE_LIKE: Final = 0.1
@@ -86,6 +87,8 @@ def read_named(
     form, unit_m = next(
         form for sign, form in _TABLES["forms"].items() if any(re.match(sign, key) for key in keys)
     )
+    units = next((str(value) for key, value in contents.items() if "WorldUnits" in key), "")
+    unit_m = _TABLES["units"].get(units, unit_m)
     if "ZED" in form:
         contents, size_px = _of_resolution(contents, size_px, path)
     if "OAK" in form:
@@ -95,6 +98,16 @@ def read_named(
     if metres_per_unit is None and rig is not None:
         _check_unit(rig.baseline_m)
     return rig
+
+
+def lens_called(name: str) -> LensModel:
+    """Return our lens model by what any program calls it."""
+    lens = _LENS_OF.get(re.sub(r"[^a-z0-9]", "", name.lower()))
+    if lens is None:
+        what, hint = "lens model is not supported", "calibrate again with one of these; fisheye is "
+        expected, hint = ", ".join(LENS_COEFFICIENTS), f"{hint}for wide lenses"
+        raise FormatError(what, got=name, expected=expected, hint=hint)
+    return lens
 
 
 @reader
@@ -118,6 +131,10 @@ def _with_others(path: Path, contents: Contents) -> Contents:
     if all(named) or (path in pair and all(each.is_file() for each in pair)):
         for side, each in zip(_BOTH, pair, strict=True):
             contents |= {f"{side}.{key}": value for key, value in read_contents(each).items()}
+    elif "projection_matrix" in contents:
+        missing = next((each for each in pair if not each.is_file()), pair[1])
+        hint = "give both files the same name but for 'left' and 'right'"
+        raise FormatError("CameraInfo of the other camera is missing", where=missing, hint=hint)
     return contents
 
 
@@ -207,7 +224,7 @@ class _Named:
         if turns[0] is None or turns[1] is None or projections is None:
             return self._rectified(*cameras)
         both = (cameras[0], turns[0].reshape(3, 3)), (cameras[1], turns[1].reshape(3, 3))
-        return rig_of_camera_infos(*both, projections, self._where)
+        return rig_of_camera_infos(*both, projections, self._where, size_px)
 
     def matrix(self, side: Side) -> Float64 | None:
         """Return the camera matrix (3, 3) of a side, pixel centres at integers; None = none."""
@@ -284,12 +301,7 @@ class _Named:
 
     def _lens(self, side: Side) -> LensModel | None:
         """Return the lens model that a file names: if it names two, the one that is no pinhole."""
-        models, expected = self._models(side), ", ".join(LENS_COEFFICIENTS)
-        for name in models:
-            if name not in _LENS_OF:
-                what = "lens model is not supported"
-                raise FormatError(what, got=name, expected=expected, hint=AGAIN)
-        lenses = sorted((_LENS_OF[name] for name in models), key="pinhole".__eq__)
+        lenses = sorted(map(lens_called, self._models(side)), key="pinhole".__eq__)
         return lenses[0] if lenses else None
 
     def _distortion(self, side: Side, lens: LensModel) -> Float64:
@@ -304,13 +316,12 @@ class _Named:
             names = LENS_COEFFICIENTS[lens][head.size : 12]  # a tilted sensor's are in no file
             given = np.array([self.number(name, side, "") or 0.0 for name in names])
             if lens == "pinhole":
-                given = given[: next(n for n in _PINHOLE_COUNTS if not given[n:].any())]
+                given = given[: next(n for n in PINHOLE_COUNTS if not given[n:].any())]
         most = len(LENS_COEFFICIENTS[lens]) - head.size
         if given is not None and not given.ravel()[most:].any():  # padded, as OAK's are
             given = given.ravel()[:most]
-        count = head.size + (sizes[0] if given is None else given.size)
-        if given is None or (lens == "pinhole" and count not in _PINHOLE_COUNTS):
-            what, got = "distortion has the wrong size", counted(count, "coefficient")
+        if given is None:
+            what, got = "distortion has the wrong size", counted(sizes[0], "coefficient")
             raise FormatError(what, got=got, expected="4, 5, 8, 12 or 14")
         if given.any() and "none" in self._models(side):
             raise FormatError("a lens without distortion has coefficients", got=given.tolist())
@@ -396,8 +407,9 @@ def _check_unit(baseline_m: float) -> None:
 def _rigid(pose: Float64) -> Float64:
     """Return a pose (4, 4) of sixteen numbers, or of a position and a quaternion."""
     values = pose.ravel()
-    if values.size == 16:
-        T = make_transform(values.reshape(4, 4)[:3, :3], values.reshape(4, 4)[:3, 3])
+    if values.size in (12, 16):
+        rows = values.reshape(-1, 4)
+        T = make_transform(rows[:3, :3], rows[:3, 3])
         check_rotation(T[:3, :3], "rotation of a pose")
         return T
     length = np.linalg.norm(values[3:])

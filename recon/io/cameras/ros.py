@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from recon.core.errors import CalibrationError, FormatError
+from recon.core.errors import CalibrationError
 from recon.core.geometry.se3 import make_transform, orthonormalise, rotation_from_quaternion
 from recon.core.text import counted
 from recon.core.values import (
@@ -28,7 +28,6 @@ from recon.core.values import (
 from recon.core.values.arrays import Float64
 from recon.io.atomic import write_text
 from recon.io.cameras.kitti import offset_m
-from recon.io.fields import Fields, read_yaml
 from recon.io.files import StrPath, read_table, reader, reading
 
 # Name -> our model and the permitted numbers of coefficients; a writer uses the first that fits.
@@ -46,7 +45,6 @@ _KALIBR_MODELS: Final[Models] = {
     "none": ("pinhole", (0,)),
 }
 NS: Final = 1e-9
-AGAIN: Final = "calibrate again with one of these; equidistant is for wide lenses"
 _SIDES: Final = ("left", "right")
 _OFF_CENTRE: Final = 0.05  # of a principal point, in image sizes: hardly a lens is mounted worse
 
@@ -62,37 +60,26 @@ def camera_info_paths(path: StrPath) -> tuple[Path, Path]:
     return left, right
 
 
-@reader
-def read_camera_info(path: StrPath, size: tuple[int, int] | None = None) -> StereoCalibration:
-    """Read a rig from either of its two files; its pose follows from ``R`` and ``P`` of both."""
-    left_path, right_path = camera_info_paths(path)
-    if not (left_path.is_file() and right_path.is_file()):
-        missing = right_path if left_path.is_file() else left_path
-        hint = "give both files the same name but for 'left' and 'right'"
-        raise FormatError("CameraInfo of the other camera is missing", where=missing, hint=hint)
-    (left, R_left, P_left), (right, R_right, P_right) = map(_read_one, (left_path, right_path))
-    projections = P_left, P_right
-    # The images may be rectified, and K be of others.
-    stated = left.width_px, left.height_px
-    if size and are_rectified((left.matrix, right.matrix), projections, stated, size):
-        focal, cx, cy = P_left[[0, 0, 1], [0, 2, 2]]
-        options = in_options(focal, -step_between(projections, path)[0], cx, cy)
-        raise CalibrationError(
-            "the images are rectified: K and D of the CameraInfo are of others, and P is of them",
-            got=f"images of {size[0]}x{size[1]} pixels",
-            hint=f"instead of the file give {options}",
-        )
-    return rig_of_camera_infos((left, R_left), (right, R_right), projections, right_path)
-
-
 def rig_of_camera_infos(
     left: tuple[CameraIntrinsics, Float64],
     right: tuple[CameraIntrinsics, Float64],
     projections: tuple[Float64, Float64],
     where: StrPath,
+    size: tuple[int, int] | None = None,
 ) -> StereoCalibration:
-    """Return the rig of cameras, their rectifying rotations (3, 3) and both ``P`` (3, 4)."""
+    """Return the rig of cameras, their rectifying rotations (3, 3) and both ``P`` (3, 4).
+
+    Images of a ``size`` (width, height) that ``P`` is of, and ``K`` is not, are refused.
+    """
     step_m = step_between(projections, where)
+    stated = left[0].width_px, left[0].height_px
+    if size and are_rectified((left[0].matrix, right[0].matrix), projections, stated, size):
+        focal, cx, cy = projections[0][[0, 0, 1], [0, 2, 2]]
+        raise CalibrationError(
+            "the images are rectified: K and D of the CameraInfo are of others, and P is of them",
+            got=f"images of {size[0]}x{size[1]} pixels",
+            hint=f"instead of the file give {in_options(focal, -step_m[0], cx, cy)}",
+        )
     with reading(where):
         for side, (_, rotation) in zip(_SIDES, (left, right), strict=True):
             check_rotation(rotation, f"rectification matrix R of the {side} CameraInfo")
@@ -141,21 +128,6 @@ def step_between(projections: tuple[Float64, Float64], where: StrPath) -> Float6
         hint="the right camera was calibrated alone, and no static transform is between both: "
         "calibrate both as a pair, or name a calibration file with --calib",
     )
-
-
-@reader
-def _read_one(path: Path) -> tuple[CameraIntrinsics, Float64, Float64]:
-    """Read a camera, its rectifying rotation (3, 3) and its projection matrix (3, 4)."""
-    fields = Fields(read_yaml(path))
-
-    def data(name: str, *shape: int) -> Float64:
-        return fields.below(name).numbers("data", shape or None)
-
-    name = fields.text("distortion_model")
-    model, distortion = lens_of(ROS_MODELS, name, data("distortion_coefficients"), path)
-    size = fields.count("image_width"), fields.count("image_height")
-    camera = CameraIntrinsics(data("camera_matrix", 3, 3), distortion, *size, model)
-    return camera, data("rectification_matrix", 3, 3), data("projection_matrix", 3, 4)
 
 
 def write_camera_info(
@@ -230,22 +202,6 @@ def in_options(focal_px: float, baseline_m: float, cx_px: float, cy_px: float) -
 def pinhole_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64:
     """Return float64 (3, 3) camera matrix, pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def lens_of(
-    models: Models, name: str, coefficients: Float64, where: StrPath
-) -> tuple[LensModel, Float64]:
-    """Return our lens model for a format's name, and its coefficients."""
-    if name not in models:
-        expected = ", ".join(models)
-        what = "lens model is not supported"
-        raise FormatError(what, where=where, got=name, expected=expected, hint=AGAIN)
-    model, counts = models[name]
-    if coefficients.size not in counts:
-        what = f"lens model {name!r} has the wrong number of coefficients"
-        expected = " or ".join(str(count) for count in counts)
-        raise FormatError(what, where=where, got=coefficients.size, expected=expected)
-    return model, coefficients
 
 
 def _name_lens(models: Models, camera: CameraIntrinsics, form: str) -> tuple[str, Float64]:

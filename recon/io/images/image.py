@@ -38,7 +38,7 @@ from recon.io.files import SMALL_FILE_BYTES, StrPath, read_bytes, reader, readin
 
 MAX_MEGAPIXELS: Final = 100.0  # larger images are refused, unless more is asked for
 _PIXEL_BYTES: Final = 16  # more than a pixel takes in any file
-_LOG_LEVEL_LOCK: Final = Lock()
+_SILENT: Final = Lock()  # for what all threads share: the log level, the filter of warnings
 _GREY_ONLY: Final = frozenset({".pgm"})
 _COLOUR_ONLY: Final = frozenset({".ppm"})
 _EIGHT_BIT_ONLY: Final = frozenset({".jpg", ".jpeg"})
@@ -201,8 +201,8 @@ def encode_image(image: NDArray[Any], suffix: str, where: StrPath) -> bytes:
 @contextmanager
 def silent_opencv() -> Iterator[None]:
     """Stop OpenCV from logging to standard error what we raise as an exception anyway."""
-    log = cv2.utils.logging  # whose level all threads share
-    with _LOG_LEVEL_LOCK:
+    log = cv2.utils.logging
+    with _SILENT:
         before = log.getLogLevel()
         log.setLogLevel(log.LOG_LEVEL_SILENT)
         try:
@@ -370,7 +370,7 @@ def stated_size(content: bytes) -> tuple[int, int] | None:
 @contextmanager
 def _silent_pillow() -> Iterator[None]:
     """Leave unsaid what Pillow warns of in damaged headers: their check says it in a line."""
-    with warnings.catch_warnings():
+    with _SILENT, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from scipy.io import savemat
+from scipy.io import loadmat, savemat
 
 from recon.core.errors import CalibrationError, FormatError, ReconError
 from recon.core.geometry.se3 import (
@@ -465,6 +465,60 @@ def test_a_damaged_file_is_read_or_one_clear_line(tmp_path, write, lens, count, 
     path.write_bytes(whole[:at] + other + whole[at + cut :] if cut else whole[:at])
     with suppress(ReconError):  # and nothing else
         read_calibration(path, *SIZE)
+
+
+def test_no_damage_to_a_file_of_matlab_ends_the_process(tmp_path):
+    generator = np.random.default_rng(3)
+    values = loadmat(matlab(tmp_path, plain_rig("pinhole", 5)), simplify_cells=True)
+    savemat(tmp_path / "c.mat", {"p": values["stereoParams"]})  # not compressed
+    whole = (tmp_path / "c.mat").read_bytes()
+    for _ in range(400):
+        damaged = np.frombuffer(whole, np.uint8).copy()
+        damaged[generator.integers(120, damaged.size, 3)] = generator.choice([0, 1, 14, 15, 255], 3)
+        (tmp_path / "c.mat").write_bytes(damaged.tobytes()[: generator.integers(1, 2 * len(whole))])
+        with suppress(ReconError):  # and nothing else
+            read_calibration(tmp_path / "c.mat", *SIZE)
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"), [("millimeters", 0.001), ("m", 1.0), ("inches", 0.0254)]
+)
+def test_lengths_of_matlab_are_in_the_unit_that_it_names(tmp_path, unit, metres):
+    values = loadmat(matlab(tmp_path, plain_rig("pinhole", 5)), simplify_cells=True)
+    parts = values["stereoParams"]
+    parts["WorldUnits"], parts["TranslationOfCamera2"] = unit, np.array([-0.12, 0, 0]) / metres
+    savemat(tmp_path / "c.mat", {"p": parts})
+    assert read_calibration(tmp_path / "c.mat", *SIZE).baseline_m == pytest.approx(0.12)
+
+
+def test_lists_of_whole_numbers_have_no_decimal_commas(tmp_path):
+    K = [[700, 0, 640], [0, 700, 360], [0, 0, 1]]
+    content = {"K1": K, "K2": K, "R": np.eye(3, dtype=int).tolist(), "T": [-1, 0, 0]}
+    (tmp_path / "c.json").write_text(json.dumps(content, separators=(",", ":")))
+    assert read_calibration(tmp_path / "c.json", *SIZE).baseline_m == 1.0
+    (tmp_path / "c.json").write_text('{"K1": [[700,5, 0, 640,2], [0, 700,5, 360], [0, 0, 1]]}')
+    with pytest.raises(FormatError, match="decimals are written with a comma"):
+        read_calibration(tmp_path / "c.json", *SIZE)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 15])
+def test_no_lens_has_coefficients_that_opencv_cannot_take(count):
+    K = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
+    with pytest.raises(CalibrationError, match="distortion has the wrong size"):
+        CameraIntrinsics(K, np.zeros(count), *SIZE)
+
+
+def test_a_pose_may_have_three_rows(tmp_path):
+    K = np.array([[700.0, 0, 640], [0, 700, 360], [0, 0, 1]])
+    T = make_transform(np.eye(3), np.array([-0.1, 0, 0]))
+    np.savez(tmp_path / "c.npz", K1=K, K2=K, T_right_left=T[:3])
+    assert read_calibration(tmp_path / "c.npz", *SIZE).baseline_m == pytest.approx(0.1)
+
+
+def test_an_archive_of_remapping_tables_alone_is_no_pickle(tmp_path):
+    np.savez(tmp_path / "c.npz", stereoMapL_x=np.zeros((720, 1280), np.float32))
+    with pytest.raises(FormatError, match=r"no matrices of cameras, but .*large tables"):
+        read_calibration(tmp_path / "c.npz", *SIZE)
 
 
 @pytest.mark.parametrize("name", ["SN123.conf", "stereo_calib.npz", "Calib_Results_stereo.mat",

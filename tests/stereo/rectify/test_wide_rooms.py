@@ -12,8 +12,7 @@ from recon.core.errors import CalibrationError, FormatError
 from recon.core.geometry.se3 import angle_rad, exp_so3, invert, make_transform
 from recon.core.values import CameraIntrinsics, RectifiedCamera, StereoCalibration
 from recon.core.values.camera import disparity_from_depth
-from recon.io.cameras.calibration import read_calibration
-from recon.io.cameras.opencv_yaml import write_opencv_calibration
+from recon.io.cameras.calibration import read_calibration, write_opencv_calibration
 from recon.io.cameras.ros import write_kalibr
 from recon.io.images.image import write_image
 from recon.map.drive.sequence import map_sequence
