@@ -86,7 +86,8 @@ def test_an_aligned_rig_keeps_its_images_and_rectified_input_passes_bit_by_bit()
     assert rectifier.valid.mean() > 0.99
     # OpenCV sizes the view by corners at -0.5: a quarter per cent of zoom at most.
     assert rectifier.camera.focal_px == pytest.approx(250, rel=0.005)
-    camera, source = RectifiedCamera(250, 160, 120, 165, 0.1, WIDTH, HEIGHT, ndisp=64), pair()
+    camera = RectifiedCamera(250, 160, 120, 165, 0.1, WIDTH, HEIGHT, ndisp=64)
+    source = StereoPair(*(cv2.blur(one, (5, 5)) for one in (pair().left, pair().right)))
     rectified = Rectifier(camera).rectify(source)
     assert rectified.camera is camera
     np.testing.assert_array_equal(rectified.left, source.left)
