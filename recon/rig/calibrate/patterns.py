@@ -34,7 +34,6 @@ _TAG_BITS: Final = 6  # along a side of tag36h11
 # Bits of another tag of the family differ in 11 of 36, and correlate by at most 1 - 2 * 11 / 36;
 # those of what is no tag by less than 0.6, in all but 1 of 10,000 cases.
 _SAME_TAG: Final = 0.6
-_REACHES: Final = (1.0, 0.7, 1.5)  # windows of the first search for a tag, relative to the usual
 # Small and blurred tags are seen in an enlarged image, sharpened by what blur of this width takes.
 _LARGEST_SCALE: Final = 3.0
 _ENLARGED_PX: Final = 2560  # its largest width
@@ -172,26 +171,15 @@ class _TagSearch:
             fresh = False
             near = {tag: self._near(tag) for tag in self._all - set(self._found)}
             for tag, known in near.items():
-                tries = (self._keep(tag, self._guess(tag, known, r)) for r in _REACHES if known)
-                fresh |= any(tries)
+                fresh |= bool(known) and self._keep(tag, self._guess(tag, known))
 
-    def _guess(self, tag: int, near: list[int], reach: float) -> Float64:
-        """Return corners (4, 2) of a tag beside known ones, the nearer two refined first."""
-        wanted, guess = _tag_m(tag, self._board), np.zeros((4, 2))
+    def _guess(self, tag: int, near: list[int]) -> Float64:
+        """Return corners (4, 2) of a tag beside known ones; zeros = not known."""
         flat = np.concatenate([_tag_m(n, self._board) for n in near])
         pixels = np.concatenate([self._found[n][1] for n in near])
-        nearest = np.argsort(np.linalg.norm(wanted - flat.mean(axis=0), axis=1))
-        for own, rest in ((nearest[:2], nearest), (nearest[2:], nearest[2:])):
-            H, _ = cv2.findHomography(flat, pixels)
-            if H is None:
-                break
-            guess[rest] = cv2.perspectiveTransform(wanted[None, rest], H)[0]
-            if self._outside(guess[rest]):
-                break
-            window_px = reach * _free_of_tags(self._board) * _scales(wanted, guess)
-            guess[own] = refine_corners(self._grey, guess[own], window_px[own])
-            flat, pixels = np.concatenate([flat, wanted[own]]), np.concatenate([pixels, guess[own]])
-        return guess
+        H, _ = cv2.findHomography(flat, pixels)
+        wanted = _tag_m(tag, self._board)
+        return np.zeros((4, 2)) if H is None else cv2.perspectiveTransform(wanted[None], H)[0]
 
     def _outside(self, pixels: Float64) -> bool:
         height, width = self._grey.shape
@@ -216,8 +204,8 @@ class _TagSearch:
         shown = cv2.aruco.generateImageMarker(dictionary(board.dictionary), tag, _TAG_BITS + 2)
         bits = shown[-2:0:-1, -2:0:-1].ravel() > 0
         likeness = float(np.corrcoef(seen, bits)[0, 1]) if np.ptp(seen) else 0.0
-        # The border of a tag is dark, and the paper beside its corners light. Where a corner is that
-        # of the square beside it, the border leaves the tag.
+        # The border of a tag is dark, and the paper beside its corners light. Where a corner is
+        # that of the square beside it, the border leaves the tag.
         middle = (seen[bits].mean() + seen[~bits].mean()) / 2
         outward = np.sign(quad_m - quad_m.mean(axis=0)) * free_m / 2
         beside = np.stack([read(quad_m + outward * turn) for turn in ((1, -1), (-1, 1))])

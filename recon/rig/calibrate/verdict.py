@@ -14,6 +14,7 @@ from recon.core.summary import Rows, RunSummary, inline, optional, shown_path
 from recon.core.text import counted, metres
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
+from recon.look.settings import AuditSettings
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.figures import CalibrationFigures, DepthErrorCm, WorkingError
@@ -41,7 +42,6 @@ _FEW_VIEWS: Final = 10
 _SMALL_COVERAGE: Final = 0.5
 _APART: Final = 2.0  # stereo error relative to that of each camera alone
 _ROWS_PX: Final = 1.0  # a block matcher loses most matches to a epipolar error of one pixel
-_USUAL_BASELINE_M: Final = (0.01, 2.0)
 # What a good set of views has, used to say what another one lacks.
 ENOUGH_VIEWS: Final = 20
 COVERED: Final = 0.8
@@ -123,7 +123,7 @@ def judge_calibration(
     found = described(
         "fatal" if ratio is None or ratio > _USABLE else "warning", _depth_faults(board, figures)
     )
-    found += described("warning", _doubts(board, figures))
+    found += described("warning", _doubts(figures))
     lacking = described("note", iter(lens))
     if verdict_of_calibration(found) != "good":
         nothing = CalibrationFinding("more", "note", _NOTHING_LACKS)
@@ -142,7 +142,7 @@ def _depth_faults(board: CalibrationBoard, found: CalibrationFigures) -> Found:
         yield "depth", {"at": at, "wrong": wrong, "percent": 100 * ratio}
 
 
-def _doubts(board: CalibrationBoard, found: CalibrationFigures) -> Found:
+def _doubts(found: CalibrationFigures) -> Found:
     if found.views_used < _FEW_VIEWS:
         yield "views", {"views": counted(found.views_used, "different view")}
     for side, ratio in (("left", found.coverage_left), ("right", found.coverage_right)):
@@ -152,16 +152,16 @@ def _doubts(board: CalibrationBoard, found: CalibrationFigures) -> Found:
         yield "together", {}
     if found.epipolar_95_px > _ROWS_PX:
         yield "rows", {}
-    shortest, longest = _USUAL_BASELINE_M
-    if board.metric and not shortest <= found.baseline_m <= longest:
-        said, given_m = board.measured
-        yield "baseline", {"said": said, "given_mm": 1e3 * given_m}
 
 
 def _left_out(board: CalibrationBoard, images: ImagePairs, found: CalibrationFigures) -> Found:
     """Yield what was left out or is not known; none of it makes the depth of this rig worse."""
+    shortest, longest = AuditSettings().baseline_m
     if not board.metric:
         yield "square", {}
+    elif not shortest <= found.baseline_m <= longest:
+        said, given_m = board.measured
+        yield "baseline", {"said": said, "given_mm": 1e3 * given_m}
     if images.by_order:
         yield "order", {}
     if images.lonely:
