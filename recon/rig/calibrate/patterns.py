@@ -179,7 +179,8 @@ class _TagSearch:
         pixels = np.concatenate([self._found[n][1] for n in near])
         H, _ = cv2.findHomography(flat, pixels)
         wanted = _tag_m(tag, self._board)
-        return np.zeros((4, 2)) if H is None else cv2.perspectiveTransform(wanted[None], H)[0]
+        guess = np.zeros((4, 2)) if H is None else cv2.perspectiveTransform(wanted[None], H)[0]
+        return np.asarray(guess, dtype=np.float64)
 
     def _outside(self, pixels: Float64) -> bool:
         height, width = self._grey.shape
@@ -196,7 +197,9 @@ class _TagSearch:
 
         def read(places_m: Float64) -> Float64:
             at = cv2.perspectiveTransform(places_m.reshape(-1, 1, 2), H).astype(np.float32)
-            return cv2.remap(self._sharp, at, None, cv2.INTER_LINEAR).astype(np.float64).ravel()
+            return np.asarray(
+                cv2.remap(self._sharp, at, None, cv2.INTER_LINEAR), np.float64
+            ).ravel()
 
         middles = np.mgrid[0:_TAG_BITS, 0:_TAG_BITS][::-1].reshape(2, -1).T - (_TAG_BITS - 1) / 2
         bit_m = board.marker_m / (_TAG_BITS + 2 * _border(board))

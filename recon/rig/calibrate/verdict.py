@@ -19,12 +19,7 @@ from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.figures import CalibrationFigures, DepthErrorCm, WorkingError
 from recon.rig.calibrate.lenses import LensChoice
-from recon.rig.calibrate.stereo import (
-    Spread,
-    StereoFit,
-    distances_m,
-    seen_cells,
-)
+from recon.rig.calibrate.stereo import Spread, StereoFit, distances_m, seen_cells
 from recon.rig.settings import CalibratedSettings
 from recon.rig.written import CalibrationForm, write_rig
 from recon.sources.images import ImagePairs
@@ -215,7 +210,6 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
-_DEPTH_CM: Final = ("calibration", "low", "high", "matching")  # of each `DepthError`
 # Figures that are also written into the calibration file.
 _KEPT: Final = (
     "verdict", "board", "stereo_rms_px", "epipolar_px", "baseline_interval_m", "focal_interval_px",
@@ -290,13 +284,12 @@ def describe_calibration(
         left = turns.place(fit.calibration, left_px)
         rows.append(left[:, 1] - turns.place(fit.calibration, right_px, right=True)[:, 1])
     epipolar_error_px = np.concatenate(rows)
-    figures = _figures(seen, fit, spread, epipolar_error_px, turns.camera.focal_px)
     figures = replace(
-        figures, held_out_px={name: lens.held_out_px for name, lens in lenses.items()}
+        _figures(seen, fit, spread, epipolar_error_px, turns.camera.focal_px),
+        held_out_px={name: lens.held_out_px for name, lens in lenses.items()},
     )
-    findings = judge_calibration(
-        seen.board, images, figures, list(lens_faults(lenses, config.calibration.model))
-    )
+    lens = list(lens_faults(lenses, config.calibration.model))
+    findings = judge_calibration(seen.board, images, figures, lens)
     summary = CalibrationSummary(
         figures=figures,
         model=config.calibration.model,
@@ -368,9 +361,7 @@ def _figures(
             for each in spread.depths
         },
         working_error=WorkingError(
-            away.depth_m,
-            _known(away.calibration_m / away.depth_m),
-            away.matching_m / away.depth_m,
+            away.depth_m, _known(away.calibration_m / away.depth_m), away.matching_m / away.depth_m
         ),
         rectified_focal_px=rectified_focal_px,
     )
