@@ -51,7 +51,9 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     assert found["coverage_left"] == len(cells) / 48
     at = f"{spread.depths[0].depth_m:g}"
     working_m = found["working_error"]["distance_m"]
-    assert all(0.2 * working_m <= each.depth_m <= 2 * working_m for each in spread.depths)
+    # The nearest of 1, 2 and 5 times powers of ten.
+    for depth, ratio in ((spread.depths[0], 0.2), (spread.depths[-1], 2.0)):
+        assert abs(np.log(depth.depth_m / (ratio * working_m))) < np.log(1.6)
     assert found["depth_error_cm"][at]["high"] == pytest.approx(100 * spread.depths[0].high_m)
     for form in get_args(CalibrationForm):
         files = write_calibration(tmp_path / form / "rig.yaml", run, form)
