@@ -13,11 +13,12 @@ from recon.core.values import LARGEST_CENTRE_OFFSET, RectifiedCamera, Rig, Stere
 from recon.core.values.arrays import Float64
 from recon.look.look import Look
 from recon.look.rig import LATER, MOST_TIME_OFFSET, MOVES, RefinedRig
-from recon.look.sample import BLANK_DN, MIN_FEATURES, Gaps, Sample, measure_mosaic, shows_texture
+from recon.look.sample import BLANK_DN, MIN_FEATURES, Gaps, Sample, measure_mosaic
 from recon.look.settings import AuditedSettings, AuditSettings
 from recon.sources.settings import SourceSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import EVENED, MatchingSettings, settings_taken
+from recon.stereo.rectify.rectifier import shows_texture
 
 Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them

@@ -23,7 +23,7 @@ from recon.odometry.pose import find_consensus, fit_pose
 from recon.sources.source import StereoSource
 from recon.stereo.rectify.epipolar import EpipolarAlignment, align_epipolar, count_aligned
 from recon.stereo.rectify.features import NO_FEATURES, PairFeatures, match_features
-from recon.stereo.rectify.rectifier import LEAST_NOISE, Rectifier, noise_sigma, to_grey
+from recon.stereo.rectify.rectifier import Rectifier
 
 _AROUND_PX: Final = 9  # half of these may be saturated before their median is
 _DARK: Final = 12.0
@@ -84,16 +84,6 @@ def measure_mosaic(image: UInt8) -> float:
     grey = (image if image.ndim == 2 else image[:, :, 1]).astype(np.int16)
     both = [[np.abs(one[by:] - one[:-by]).mean() for one in (grey, grey.T)] for by in (1, 2)]
     return float(min(both[0]) / max(*both[1], 1e-9))
-
-
-def shows_texture(image: UInt8) -> bool:
-    """Return whether most of an image has more fine texture than noise.
-
-    Halving an image takes half of the noise of its pixels, but leaves texture what it is.
-    """
-    grey = to_grey(image)
-    small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    return noise_sigma(small) >= max(noise_sigma(grey), 2 * LEAST_NOISE)
 
 
 @dataclass

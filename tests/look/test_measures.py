@@ -15,6 +15,7 @@ from recon.look.findings import Finding, verdict_of
 from recon.look.sample import QUICK, THOROUGH, plan_windows
 from recon.look.tracks import REACH
 from recon.stereo.rectify.epipolar import align_epipolar, correct_rig, count_aligned, turn_features
+from recon.stereo.rectify.rectifier import shows_texture
 
 CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
 
@@ -177,9 +178,9 @@ def test_texture_is_told_from_noise_in_the_dark():
         return np.clip(np.rint(mean + detail), 0, 255).astype(np.uint8)
 
     noise = [of(rng.normal(0, sigma, (240, 320)), 21) for sigma in (0.2, 1.0, 2.0, 6.0)]
-    assert not any(map(sample.shows_texture, noise))
+    assert not any(map(shows_texture, noise))
     # As much at every size, as of leaves and gravel, but what a lens blurs.
     sizes = [rng.normal(0, 4.0, (240 // k, 320 // k)).astype(np.float32) for k in (2, 4, 8, 16)]
     texture = sum(cv2.resize(each, (320, 240), interpolation=cv2.INTER_CUBIC) for each in sizes)
-    assert sample.shows_texture(of(texture, 21))
-    assert sample.shows_texture(np.dstack([of(2 * texture, 90)] * 3))
+    assert shows_texture(of(texture, 21))
+    assert shows_texture(np.dstack([of(2 * texture, 90)] * 3))
