@@ -18,6 +18,7 @@ from recon.look.settings import AuditedSettings, AuditSettings
 from recon.sources.settings import SourceSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import EVENED, MatchingSettings, settings_taken
+from recon.stereo.rectify.rectifier import shows_texture
 
 Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
@@ -40,7 +41,8 @@ _NEAR_RATIO: Final = 0.02  # fraction of features beyond the disparity range tha
 _FAR_PX: Final = 1.5  # a scene with a smaller median disparity is too far for the baseline
 _MAX_SPEED_M_PER_S: Final = 70.0  # a higher apparent speed means that the baseline is wrong
 # Faint texture differs by a tenth of its brightness; matching needs it at twice the noise of a dark
-# image, which is about one grey level, and that of the rounding.
+# image, which is about one grey level, and that of the rounding. Where more is seen than noise, a
+# dark image is no fault; see `shows_texture`.
 _DARK_DN: Final = 2.0 * (1.0 + 12**-0.5) / 0.1
 _TEXTS: Final = {
     "unreadable": "{error}",
@@ -137,14 +139,17 @@ def _of_images(sample: Sample, matcher: str | Matcher) -> Found:
         mean = np.median([one.brightness_dn[side] for one in sample.pairs])
         yield "black", {"side": _SIDES[side], "mean": mean}
     pairs = [one for one in sample.recorded if isinstance(one, StereoPair)]
-    for name in _SIDES if pairs else ():
-        if np.median([measure_mosaic(getattr(pair, name)) for pair in pairs]) > _MOSAIC:
+    dark = {}
+    for number, name in enumerate(_SIDES if pairs else ()):
+        images = [getattr(pair, name) for pair in pairs]
+        if np.median([measure_mosaic(image) for image in images]) > _MOSAIC:
             yield "mosaic", {"side": name}
-    means = np.median([one.brightness_dn for one in sample.pairs] or [(255.0, 255.0)], axis=0)
-    dark = [n for n in range(2) if means[n] < _DARK_DN and n not in _blank_sides(sample)]
+        mean = float(np.median([image.mean() for image in images]))
+        textured = np.mean([shows_texture(image) for image in images]) > 0.5
+        if mean < _DARK_DN and not textured and number not in _blank_sides(sample):
+            dark[name] = mean
     if dark:
-        both = " and ".join(_SIDES[side] for side in dark)
-        yield "dark", {"side": both, "mean": means[dark].min()}
+        yield "dark", {"side": " and ".join(dark), "mean": min(dark.values())}
     if sample.sharpness is not None:
         left, right = sample.sharpness
         worse, better = min(left, right), max(left, right)

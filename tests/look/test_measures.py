@@ -15,6 +15,7 @@ from recon.look.findings import Finding, verdict_of
 from recon.look.sample import QUICK, THOROUGH, plan_windows
 from recon.look.tracks import REACH
 from recon.stereo.rectify.epipolar import align_epipolar, correct_rig, count_aligned, turn_features
+from recon.stereo.rectify.rectifier import shows_texture
 
 CAMERA = RectifiedCamera(500.0, 319.5, 199.5, 330.5, 0.3, 640, 400)
 
@@ -168,3 +169,18 @@ def test_what_is_looked_at_lies_within_the_drive(frames, extent):
     assert [window.tracked for window in windows][: len(tracked)] == tracked
     if frames <= QUICK.frames:
         assert (windows[0].start, windows[-1].stop) == (0, frames)
+
+
+def test_texture_is_told_from_noise_in_the_dark():
+    rng = np.random.default_rng(3)
+
+    def of(detail: np.ndarray, mean: float) -> np.ndarray:
+        return np.clip(np.rint(mean + detail), 0, 255).astype(np.uint8)
+
+    noise = [of(rng.normal(0, sigma, (240, 320)), 21) for sigma in (0.2, 1.0, 2.0, 6.0)]
+    assert not any(map(shows_texture, noise))
+    # As much at every size, as of leaves and gravel, but what a lens blurs.
+    sizes = [rng.normal(0, 4.0, (240 // k, 320 // k)).astype(np.float32) for k in (2, 4, 8, 16)]
+    texture = sum(cv2.resize(each, (320, 240), interpolation=cv2.INTER_CUBIC) for each in sizes)
+    assert shows_texture(of(texture, 21))
+    assert shows_texture(np.dstack([of(2 * texture, 90)] * 3))

@@ -205,6 +205,21 @@ def test_frames_that_are_missing_are_reported_and_noise_is_no_frozen_camera(stre
     assert not found & {"frozen", "duplicates"}
 
 
+def test_a_dark_drive_is_said_with_its_grey_level_and_is_not_fatal(street):
+    def dark(index: int) -> StereoPair:
+        rng, pair = np.random.default_rng(index), street.take(index)
+        left, right = (
+            np.clip(np.rint(0.2 * image + rng.normal(0, 1.0, image.shape)), 0, 255).astype(np.uint8)
+            for image in (pair.left, pair.right)
+        )
+        return replace(pair, left=left, right=right)
+
+    findings = audit_source(replace(street, take=dark), CONFIG, quick=True).findings
+    (said,) = (finding for finding in findings if finding.code == "dark")
+    assert "images of the left and right camera are dark: mean grey level 2" in said.text
+    assert not said.fatal
+
+
 def test_cameras_that_are_late_or_hang_are_measured_and_a_black_image_is_neither(street):
     """Pairs at half speed stand in for skew: every other frame, the right one in between."""
 

@@ -23,6 +23,8 @@ class _Kind:
     each: int  # corners along one side of a column
     said: str  # what the given length is of
     most: int = 1  # lengths and words after the size
+    usual: float = 0.0  # the second length, relative to the first
+    dictionary: str = ""
     numbered: bool = False  # whether its corners cannot be taken for one another
     other: str = ""  # name of its other layout
 
@@ -34,21 +36,21 @@ _KINDS: Final[dict[str, _Kind]] = {
     "charuco": _Kind(
         "charuco:COLUMNSxROWS:SQUARE[:MARKER[:DICTIONARY]] "
         "(squares, such as charuco:8x6:30mm:22mm:5x5_100)",
-        1, 1, "squares", 3, True, "legacy",
+        1, 1, "squares", 3, 0.75, "5X5_100", True, "legacy",
     ),
     "aprilgrid": _Kind(
         "aprilgrid:COLUMNSxROWS:TAG[:GAP] (tags, and the gap between them relative to a tag, such "
         "as aprilgrid:6x6:88mm:0.3)",
-        0, 2, "tags", 2, True, "thin",
+        0, 2, "tags", 2, 0.3, "APRILTAG_36H11", True, "thin",
     ),
     "circles": _Kind(
         "circles:COLUMNSxROWS:STEP[:DIAMETER] (circles, such as circles:7x6:20mm:10mm)",
-        0, 1, "steps", 2,
+        0, 1, "steps", 2, 0.4,
     ),
     "acircles": _Kind(
         "acircles:COLUMNSxROWS:STEP[:DIAMETER] (every other row is one step to the right, such as "
         "acircles:4x11:20mm:16mm)",
-        0, 1, "steps", 2,
+        0, 1, "steps", 2, 0.4,
     ),
 }  # fmt: skip
 _FORMS: Final = ", ".join(kind.form for kind in _KINDS.values()) + ", or a target.yaml of kalibr"
@@ -57,11 +59,6 @@ _LENGTH: Final = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*(mm|cm|m|in|)", re.IGNOREC
 _SIZE: Final = re.compile(r"(\d+)\s*[x×]\s*(\d+)", re.IGNORECASE | re.ASCII)
 _DICTIONARY: Final = re.compile(r"(?:DICT_)?(\w+)", re.IGNORECASE)
 _LARGEST_SQUARE_M: Final = 5.0
-_DEFAULT_MARKER: Final = 0.75  # of a square
-_DEFAULT_DICTIONARY: Final = "5X5_100"
-_DEFAULT_GAP: Final = 0.3  # of a tag
-_DEFAULT_DIAMETER: Final = 0.4  # of a step, as OpenCV draws them
-_TAGS: Final = "APRILTAG_36H11"
 
 
 @dataclass(frozen=True)
@@ -185,16 +182,12 @@ def parse_board(text: str) -> CalibrationBoard:
     if found is None or len(own) > kind.most + legacy:
         raise _unreadable(text)
     given_m = _length_m(own[0], text) if own else 1.0
-    square_m, marker_m, dictionary = given_m, 0.0, ""
+    second = _length_m(own[1], text) if len(own) > 1 else None
+    square_m, marker_m = given_m, kind.usual * given_m if second is None else second
     if name.lower() == "aprilgrid":
-        gap = _length_m(own[1], text) if len(own) > 1 else _DEFAULT_GAP
-        square_m, marker_m, dictionary = given_m * (1 + gap), given_m, _TAGS
-    elif name.lower() != "chess":
-        usual = _DEFAULT_MARKER if name.lower() == "charuco" else _DEFAULT_DIAMETER
-        marker_m = _length_m(own[1], text) if len(own) > 1 else given_m * usual
-    if name.lower() == "charuco":
-        word = _DICTIONARY.fullmatch(own[2]) if len(own) > 2 else None
-        dictionary = word[1].upper() if word else _DEFAULT_DICTIONARY
+        square_m, marker_m = given_m * (1 + (kind.usual if second is None else second)), given_m
+    word = _DICTIONARY.fullmatch(own[2]) if own[2 : kind.most] else None
+    dictionary = word[1].upper() if word else kind.dictionary
     known = cast("BoardKind", name.lower())
     columns, rows = int(found[1]), int(found[2])
     return CalibrationBoard(known, columns, rows, square_m, marker_m, dictionary, bool(own), legacy)

@@ -16,10 +16,10 @@ from recon.core.values.arrays import Bool, UInt8
 from recon.core.values.board import CalibrationBoard
 from recon.rig.calibrate.bundle import Sighting
 from recon.rig.calibrate.patterns import find_board
-from recon.rig.calibrate.stereo import CELLS
+from recon.rig.calibrate.stereo import CELLS, cells_of
 from recon.rig.calibrate.verdict import COVERED, ENOUGH_VIEWS, FAR_TO_NEAR, TILT_DEG, TILTED
 from recon.rig.capture import CapturedPair
-from recon.stereo.rectify.rectifier import to_grey
+from recon.stereo.rectify.rectifier import noise_sigma, to_grey
 
 _WANTED_PX: Final = 0.1  # error of a corner that lenses are fitted to
 _SOFT_PX: Final = 3.0  # width of an edge; two pixels are those of a sharp image
@@ -46,8 +46,7 @@ class BoardGuide:
                 return f"{side} image: {fault}"
         for cells, grey, one in zip(self._cells, greys, seen, strict=True):
             if one is not None:
-                at = np.floor(one.pixels / grey.shape[::-1] * CELLS).astype(int)
-                cells[tuple(np.clip(at, 0, np.array(CELLS) - 1).T)] = True
+                cells[cells_of(one.pixels, (grey.shape[1], grey.shape[0]))] = True
         if seen[0] is not None:
             self._add(seen[0])
         return self.advice()
@@ -70,9 +69,8 @@ class BoardGuide:
         side = int(np.argmin(covered))
         lacks = [f"{counted(len(self._views), 'view')} of {ENOUGH_VIEWS}"]
         if covered[side] < COVERED:
-            lacks.append(
-                f"show it {_where(self._cells[side])} of the {('left', 'right')[side]} image"
-            )
+            where = _where(self._cells[side])
+            lacks.append(f"show it {where} of the {('left', 'right')[side]} image")
         if tilted < TILTED:
             lacks.append(f"tilt it: {100 * tilted:.0f} % of the views are")
         if math.exp(np.ptp(scales)) < FAR_TO_NEAR:
@@ -94,13 +92,11 @@ def _where(cells: Bool) -> str:
 def fault_of(grey: UInt8, seen: Sighting) -> str:
     """Return why corners are measured badly, from noise and contrast of the board; "" = well."""
     x, y, width, height = cv2.boundingRect(seen.pixels.astype(np.float32))
-    part = grey[max(y, 0) : y + height, max(x, 0) : x + width].astype(np.float32)
+    part = grey[max(y, 0) : y + height, max(x, 0) : x + width]
     dark, light = np.quantile(part, (0.1, 0.9))
     contrast = max(float(light - dark), 1.0)
-    # Ref: Immerkaer 1996, "Fast noise variance estimation": what no straight edge answers to.
-    mask = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)
-    noise = max(float(np.median(np.abs(cv2.filter2D(part, -1, mask)))) / 0.6745 / 6, 0.3)
-    smooth = cv2.GaussianBlur(part, (0, 0), 1.0)
+    noise = noise_sigma(part)
+    smooth = cv2.GaussianBlur(part.astype(np.float32), (0, 0), 1.0)
     steepest = np.quantile(np.hypot(*np.gradient(smooth)), 0.99)
     # The smoothing by one pixel is taken off; an edge of noise has no width.
     edge_px = math.sqrt(max((contrast / max(float(steepest), 1e-3)) ** 2 - 2 * math.pi, 1.0))

@@ -31,9 +31,14 @@ _FEWEST_CORNERS: Final = 8
 _LOST: Final = 1.5  # corners that refinement moves farther, relative to its window, stay
 _PREFIX: Final = "DICT_"
 _TAG_BITS: Final = 6  # along a side of tag36h11
-# Bits of another tag of the family differ in 11 of 36: they correlate by at most 1 - 2 * 11 / 36.
-_SAME_TAG: Final = 0.7
-_REACHES: Final = (1.0, 0.7, 1.5)  # windows of the first search for a tag, relative to the usual
+# Bits of another tag of the family differ in 11 of 36, and correlate by at most 1 - 2 * 11 / 36;
+# those of what is no tag by less than 0.6, in all but 1 of 10,000 cases.
+_SAME_TAG: Final = 0.6
+# Small and blurred tags are seen in an enlarged image, sharpened by what blur of this width takes.
+_LARGEST_SCALE: Final = 3.0
+_ENLARGED_PX: Final = 2560  # its largest width
+_SHARPER: Final = 4.0
+_BLUR_PX: Final = 1.5
 _ROUND: Final = 2.0 * math.pi * np.arange(64) / 64
 
 
@@ -118,101 +123,107 @@ def _find_charuco(grey: UInt8, board: CalibrationBoard) -> Found | None:
 
 
 def _find_tags(grey: UInt8, board: CalibrationBoard) -> Found | None:
-    # The squares between tags touch their corners, which hides most tags from OpenCV. Where one is
-    # known, its neighbours are looked for where they must be.
-    found: dict[int, tuple[float, Float64]] = {}
-    for scale in (1, 2):  # enlarged, more are separate
-        large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-        corners, ids, _ = _tag_detector(_border(board)).detectMarkers(large)
-        for tag, quad in zip([] if ids is None else ids.ravel().tolist(), corners, strict=True):
-            pixels = (quad.reshape(4, 2)[[1, 0, 2, 3]].astype(np.float64) + 0.5) / scale - 0.5
-            _keep_tag(found, grey, board, tag, pixels)
-        if found:
-            break
-    fresh = set(found)
-    while fresh:
-        known, fresh = {tag: quad for tag, (_, quad) in found.items()}, set()
-        for tag in set(range(board.columns * board.rows)) - set(known):
-            near = [n for n in _around(tag, board) if n in known]
-            for reach in _REACHES if near else ():
-                if tag not in fresh:
-                    guess = _guess_tag(grey, board, tag, {n: known[n] for n in near}, reach)
-                    fresh |= _keep_tag(found, grey, board, tag, guess)
-    alone = {tag for tag in found if not any(n in found for n in _around(tag, board))}
-    tags = sorted(found if len(alone) == len(found) else set(found) - alone)
+    tags = _TagSearch(grey, board).find()
     if not tags:
         return None
     numbers = np.concatenate([_tag_corners(tag, board) for tag in tags])
-    return numbers.astype(np.int32), np.concatenate([found[tag][1] for tag in tags]), grey
+    return numbers.astype(np.int32), np.concatenate(list(tags.values())), grey
 
 
-def _guess_tag(
-    grey: UInt8, board: CalibrationBoard, tag: int, near: dict[int, Float64], reach: float
-) -> Float64:
-    """Return corners (4, 2) of a tag beside known ones, the nearer two refined first."""
-    flat, wanted = np.concatenate([_tag_m(n, board) for n in near]), _tag_m(tag, board)
-    pixels, guess = np.concatenate(list(near.values())), np.zeros((4, 2))
-    nearest = np.argsort(np.linalg.norm(wanted - flat.mean(axis=0), axis=1))
-    for own in (nearest[:2], nearest[2:]):
+class _TagSearch:
+    """The tags of a board that are found in an image, each with the likeness of its bits."""
+
+    def __init__(self, grey: UInt8, board: CalibrationBoard) -> None:
+        self._grey, self._board = grey, board
+        self._sharp = _sharpened(grey, 1.0)
+        self._all = set(range(board.columns * board.rows))
+        self._found: dict[int, tuple[float, Float64]] = {}
+
+    def find(self) -> dict[int, Float64]:
+        """Return corners (4, 2) of tags, px: lower left and right, upper left and right."""
+        # The squares between tags touch their corners, which hides most tags from OpenCV. Where one
+        # is known, its neighbours are looked for where they must be.
+        enlarged = min(_LARGEST_SCALE, _ENLARGED_PX / self._grey.shape[1])
+        for scale in (1.0, enlarged):
+            large = self._grey if scale == 1 else _sharpened(self._grey, scale)
+            corners, ids, _ = _tag_detector(_border(self._board)).detectMarkers(large)
+            for tag, quad in zip([] if ids is None else ids.ravel().tolist(), corners, strict=True):
+                pixels = quad.reshape(4, 2)[[1, 0, 2, 3]].astype(np.float64)
+                self._keep(tag, (pixels + 0.5) / scale - 0.5)
+            self._grow()
+            if len(self._found) == len(self._all):
+                break
+        alone = {tag for tag in self._found if not self._near(tag)}
+        kept = self._found if len(alone) == len(self._found) else set(self._found) - alone
+        return {tag: self._found[tag][1] for tag in sorted(kept)}
+
+    def _near(self, tag: int) -> list[int]:
+        """Return the tags that were found around one."""
+        row, column = divmod(tag, self._board.columns)
+        rows = range(max(row - 1, 0), row + 2)
+        columns = range(max(column - 1, 0), min(column + 2, self._board.columns))
+        around = [r * self._board.columns + c for r in rows for c in columns]
+        return [n for n in around if n in self._found and n != tag]
+
+    def _grow(self) -> None:
+        fresh = bool(self._found)
+        while fresh:
+            fresh = False
+            near = {tag: self._near(tag) for tag in self._all - set(self._found)}
+            for tag, known in near.items():
+                fresh |= bool(known) and self._keep(tag, self._guess(tag, known))
+
+    def _guess(self, tag: int, near: list[int]) -> Float64:
+        """Return corners (4, 2) of a tag beside known ones; zeros = not known."""
+        flat = np.concatenate([_tag_m(n, self._board) for n in near])
+        pixels = np.concatenate([self._found[n][1] for n in near])
         H, _ = cv2.findHomography(flat, pixels)
-        if H is None:
-            return guess
-        rest = nearest if own[0] == nearest[0] else own
-        guess[rest] = cv2.perspectiveTransform(wanted[None, rest], H)[0]
-        if _outside(grey, guess[rest]):
-            return guess
-        window_px = reach * _free_of_tags(board) * _scales(wanted, guess)
-        guess[own] = refine_corners(grey, guess[own], window_px[own])
-        flat, pixels = np.concatenate([flat, wanted[own]]), np.concatenate([pixels, guess[own]])
-    return guess
+        wanted = _tag_m(tag, self._board)
+        guess = np.zeros((4, 2)) if H is None else cv2.perspectiveTransform(wanted[None], H)[0]
+        return np.asarray(guess, dtype=np.float64)
+
+    def _outside(self, pixels: Float64) -> bool:
+        height, width = self._grey.shape
+        return not ((pixels >= 1) & (pixels <= (width - 2, height - 2))).all()  # NaN, too
+
+    def _keep(self, tag: int, guess: Float64) -> bool:
+        """Add a tag if its bits and corners are read at its refined corners."""
+        board = self._board
+        if tag not in self._all or self._outside(guess):
+            return False
+        quad_m, free_m = _tag_m(tag, board), _free_of_tags(board)
+        quad = refine_corners(self._grey, guess, free_m * _scales(quad_m, guess))
+        H = cv2.getPerspectiveTransform(quad_m.astype(np.float32), quad.astype(np.float32))
+
+        def read(places_m: Float64) -> Float64:
+            at = cv2.perspectiveTransform(places_m.reshape(-1, 1, 2), H).astype(np.float32)
+            return np.asarray(
+                cv2.remap(self._sharp, at, None, cv2.INTER_LINEAR), np.float64
+            ).ravel()
+
+        middles = np.mgrid[0:_TAG_BITS, 0:_TAG_BITS][::-1].reshape(2, -1).T - (_TAG_BITS - 1) / 2
+        bit_m = board.marker_m / (_TAG_BITS + 2 * _border(board))
+        seen = read(quad_m.mean(axis=0) + middles * bit_m)
+        shown = cv2.aruco.generateImageMarker(dictionary(board.dictionary), tag, _TAG_BITS + 2)
+        bits = shown[-2:0:-1, -2:0:-1].ravel() > 0
+        likeness = float(np.corrcoef(seen, bits)[0, 1]) if np.ptp(seen) else 0.0
+        # The border of a tag is dark, and the paper beside its corners light. Where a corner is
+        # that of the square beside it, the border leaves the tag.
+        middle = (seen[bits].mean() + seen[~bits].mean()) / 2
+        outward = np.sign(quad_m - quad_m.mean(axis=0)) * free_m / 2
+        beside = np.stack([read(quad_m + outward * turn) for turn in ((1, -1), (-1, 1))])
+        border = np.linspace(quad_m - outward, (quad_m - outward)[[1, 3, 0, 2]], 5)[:-1]
+        fits = (read(border) < middle).all() and (beside > middle).all()
+        better = bool(fits) and likeness > max(_SAME_TAG, self._found.get(tag, (0.0,))[0])
+        if better:
+            self._found[tag] = likeness, quad
+        return better
 
 
-def _outside(grey: UInt8, pixels: Float64) -> bool:
-    height, width = grey.shape
-    return not ((pixels >= 1) & (pixels <= (width - 2, height - 2))).all()  # NaN, too
-
-
-def _keep_tag(
-    found: dict[int, tuple[float, Float64]],
-    grey: UInt8,
-    board: CalibrationBoard,
-    tag: int,
-    guess: Float64,
-) -> set[int]:
-    """Add a tag whose bits and corners are read at its refined corners; return it if so."""
-    if _outside(grey, guess) or tag >= board.columns * board.rows:
-        return set()
-    quad_m, free_m = _tag_m(tag, board), _free_of_tags(board)
-    reach_px = free_m * _scales(quad_m, guess)
-    quad = refine_corners(grey, guess, reach_px)
-    H = cv2.getPerspectiveTransform(quad_m.astype(np.float32), quad.astype(np.float32))
-
-    def read(places_m: Float64) -> Float64:
-        at = cv2.perspectiveTransform(places_m.reshape(-1, 1, 2), H).astype(np.float32)
-        return np.asarray(cv2.remap(grey, at, None, cv2.INTER_LINEAR), dtype=np.float64).ravel()
-
-    bit_m = board.marker_m / (_TAG_BITS + 2 * _border(board))
-    middles_m = (np.mgrid[0:_TAG_BITS, 0:_TAG_BITS][::-1] - (_TAG_BITS - 1) / 2) * bit_m
-    seen = read(quad_m.mean(axis=0) + middles_m.reshape(2, -1).T)
-    shown = cv2.aruco.generateImageMarker(dictionary(board.dictionary), tag, _TAG_BITS + 2)
-    bits = shown[-2:0:-1, -2:0:-1].ravel() > 0
-    likeness = float(np.corrcoef(seen, bits)[0, 1]) if np.ptp(seen) else 0.0
-    # A tag is dark inside of each corner, and the paper beside it light.
-    middle = (seen[bits].mean() + seen[~bits].mean()) / 2
-    outward = np.sign(quad_m - quad_m.mean(axis=0)) * free_m / 2
-    beside = np.stack([read(quad_m + outward * turn) for turn in ((1, -1), (-1, 1))])
-    fits = (read(quad_m - outward) < middle).all() and (beside > middle).all()
-    if not fits or likeness < max(_SAME_TAG, found.get(tag, (0.0,))[0]):
-        return set()
-    found[tag] = likeness, quad
-    return {tag}
-
-
-def _around(tag: int, board: CalibrationBoard) -> list[int]:
-    row, column = divmod(tag, board.columns)
-    rows = range(max(row - 1, 0), min(row + 2, board.rows))
-    columns = range(max(column - 1, 0), min(column + 2, board.columns))
-    return [r * board.columns + c for r in rows for c in columns if (r, c) != (row, column)]
+def _sharpened(grey: UInt8, scale: float) -> UInt8:
+    large = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    smooth = cv2.GaussianBlur(large, (0, 0), _BLUR_PX * scale)
+    return np.asarray(cv2.addWeighted(large, 1 + _SHARPER, smooth, -_SHARPER, 0), dtype=np.uint8)
 
 
 def _tag_corners(tag: int, board: CalibrationBoard) -> Int32:
@@ -223,10 +234,12 @@ def _tag_corners(tag: int, board: CalibrationBoard) -> Int32:
 
 
 def _tag_m(tag: int, board: CalibrationBoard) -> Float64:
+    """Return float64 (4, 2), corners of a tag on the board, metres."""
     return board.corners_m[_tag_corners(tag, board), :2]
 
 
 def _free_of_tags(board: CalibrationBoard) -> float:
+    """Return how far from a corner nothing but its four quadrants is, metres, less some margin."""
     border_m = board.marker_m * _border(board) / (_TAG_BITS + 2 * _border(board))
     return _FREE * min(border_m, board.square_m - board.marker_m)
 
@@ -240,6 +253,7 @@ def _border(board: CalibrationBoard) -> int:
 def _tag_detector(border: int) -> Any:
     settings = cv2.aruco.DetectorParameters()
     settings.markerBorderBits = border
+    settings.errorCorrectionRate = 1.0  # what is no tag is found out by its bits and corners
     return cv2.aruco.ArucoDetector(dictionary("APRILTAG_36H11"), settings)
 
 

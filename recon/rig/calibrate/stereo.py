@@ -413,9 +413,8 @@ def _interval(values: list[float]) -> tuple[float, float]:
 def _depth_error(fit: StereoFit, rigs: list[StereoCalibration], depth_m: float) -> DepthError:
     rig = fit.calibration
     left_seen, right_seen = (seen_cells(fit, side) for side in (0, 1))
-    size = np.array([rig.left.width_px, rig.left.height_px])
-    middle_px = np.array([size / 2])
-    places = np.concatenate([middle_px, (np.argwhere(left_seen) + 0.5) / CELLS * size])
+    size = rig.left.width_px, rig.left.height_px
+    places = np.concatenate([np.array([size]) / 2, (np.argwhere(left_seen) + 0.5) / CELLS * size])
     xyz = rays_of(rig.left, places) * depth_m
     right_px = project_into_image(rig.right, apply(rig.T_right_left, xyz))
     shared = np.asarray(np.isfinite(right_px).all(axis=1))
@@ -424,7 +423,7 @@ def _depth_error(fit: StereoFit, rigs: list[StereoCalibration], depth_m: float) 
     if not shared[0]:
         return DepthError(depth_m, np.nan, np.nan, np.nan, matching_m)
     # Elsewhere the lens is extrapolated, of which the coverage tells.
-    shared[shared] = right_seen[cells_of(right_px[shared], rig.right)]
+    shared[shared] = right_seen[cells_of(right_px[shared], size)]
     shared[0] = True
     errors = np.array([measure_depth(r, places[shared], right_px[shared]) for r in rigs]) - depth_m
     low_m, high_m = _interval(list(errors[:, 0]))
@@ -436,18 +435,17 @@ def _depth_error(fit: StereoFit, rigs: list[StereoCalibration], depth_m: float) 
     return DepthError(depth_m, rms_m, low_m, high_m, matching_m)
 
 
-def cells_of(pixels: Float64, camera: CameraIntrinsics) -> tuple[NDArray[np.intp], ...]:
+def cells_of(pixels: Float64, size: Size) -> tuple[NDArray[np.intp], ...]:
     """Return column and row (N,) of the cells of an image in which pixels (N, 2) are."""
-    size = np.array([camera.width_px, camera.height_px])
     cells = np.floor((pixels + 0.5) / size * CELLS).astype(np.intp)
     return tuple(np.clip(cells, 0, np.array(CELLS) - 1).T)
 
 
 def seen_cells(fit: StereoFit, side: int) -> Bool:
     """Return bool `CELLS`: in which cells of an image a corner was seen."""
-    seen = np.zeros(CELLS, dtype=bool)
-    pixels = np.concatenate([view.seen[side].pixels for view in fit.views])
-    seen[cells_of(pixels, fit.state.cameras[side])] = True
+    seen, camera = np.zeros(CELLS, dtype=bool), fit.state.cameras[side]
+    for view in fit.views:
+        seen[cells_of(view.seen[side].pixels, (camera.width_px, camera.height_px))] = True
     return seen
 
 

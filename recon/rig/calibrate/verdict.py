@@ -14,16 +14,12 @@ from recon.core.summary import Rows, RunSummary, inline, optional, shown_path
 from recon.core.text import counted, metres
 from recon.core.values.arrays import Float64
 from recon.core.values.board import CalibrationBoard
+from recon.look.settings import AuditSettings
 from recon.rig.calibrate.board_views import BoardViews
 from recon.rig.calibrate.bundle import View
 from recon.rig.calibrate.figures import CalibrationFigures, DepthErrorCm, WorkingError
 from recon.rig.calibrate.lenses import LensChoice
-from recon.rig.calibrate.stereo import (
-    Spread,
-    StereoFit,
-    distances_m,
-    seen_cells,
-)
+from recon.rig.calibrate.stereo import Spread, StereoFit, distances_m, seen_cells
 from recon.rig.settings import CalibratedSettings
 from recon.rig.written import CalibrationForm, write_rig
 from recon.sources.images import ImagePairs
@@ -41,7 +37,6 @@ _FEW_VIEWS: Final = 10
 _SMALL_COVERAGE: Final = 0.5
 _APART: Final = 2.0  # stereo error relative to that of each camera alone
 _ROWS_PX: Final = 1.0  # a block matcher loses most matches to a epipolar error of one pixel
-_USUAL_BASELINE_M: Final = (0.01, 2.0)
 # What a good set of views has, used to say what another one lacks.
 ENOUGH_VIEWS: Final = 20
 COVERED: Final = 0.8
@@ -123,7 +118,7 @@ def judge_calibration(
     found = described(
         "fatal" if ratio is None or ratio > _USABLE else "warning", _depth_faults(board, figures)
     )
-    found += described("warning", _doubts(board, figures))
+    found += described("warning", _doubts(figures))
     lacking = described("note", iter(lens))
     if verdict_of_calibration(found) != "good":
         nothing = CalibrationFinding("more", "note", _NOTHING_LACKS)
@@ -142,7 +137,7 @@ def _depth_faults(board: CalibrationBoard, found: CalibrationFigures) -> Found:
         yield "depth", {"at": at, "wrong": wrong, "percent": 100 * ratio}
 
 
-def _doubts(board: CalibrationBoard, found: CalibrationFigures) -> Found:
+def _doubts(found: CalibrationFigures) -> Found:
     if found.views_used < _FEW_VIEWS:
         yield "views", {"views": counted(found.views_used, "different view")}
     for side, ratio in (("left", found.coverage_left), ("right", found.coverage_right)):
@@ -152,16 +147,16 @@ def _doubts(board: CalibrationBoard, found: CalibrationFigures) -> Found:
         yield "together", {}
     if found.epipolar_95_px > _ROWS_PX:
         yield "rows", {}
-    shortest, longest = _USUAL_BASELINE_M
-    if board.metric and not shortest <= found.baseline_m <= longest:
-        said, given_m = board.measured
-        yield "baseline", {"said": said, "given_mm": 1e3 * given_m}
 
 
 def _left_out(board: CalibrationBoard, images: ImagePairs, found: CalibrationFigures) -> Found:
     """Yield what was left out or is not known; none of it makes the depth of this rig worse."""
+    shortest, longest = AuditSettings().baseline_m
     if not board.metric:
         yield "square", {}
+    elif not shortest <= found.baseline_m <= longest:
+        said, given_m = board.measured
+        yield "baseline", {"said": said, "given_mm": 1e3 * given_m}
     if images.by_order:
         yield "order", {}
     if images.lonely:
@@ -215,7 +210,6 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
-_DEPTH_CM: Final = ("calibration", "low", "high", "matching")  # of each `DepthError`
 # Figures that are also written into the calibration file.
 _KEPT: Final = (
     "verdict", "board", "stereo_rms_px", "epipolar_px", "baseline_interval_m", "focal_interval_px",
@@ -290,13 +284,12 @@ def describe_calibration(
         left = turns.place(fit.calibration, left_px)
         rows.append(left[:, 1] - turns.place(fit.calibration, right_px, right=True)[:, 1])
     epipolar_error_px = np.concatenate(rows)
-    figures = _figures(seen, fit, spread, epipolar_error_px, turns.camera.focal_px)
     figures = replace(
-        figures, held_out_px={name: lens.held_out_px for name, lens in lenses.items()}
+        _figures(seen, fit, spread, epipolar_error_px, turns.camera.focal_px),
+        held_out_px={name: lens.held_out_px for name, lens in lenses.items()},
     )
-    findings = judge_calibration(
-        seen.board, images, figures, list(lens_faults(lenses, config.calibration.model))
-    )
+    lens = list(lens_faults(lenses, config.calibration.model))
+    findings = judge_calibration(seen.board, images, figures, lens)
     summary = CalibrationSummary(
         figures=figures,
         model=config.calibration.model,
@@ -368,9 +361,7 @@ def _figures(
             for each in spread.depths
         },
         working_error=WorkingError(
-            away.depth_m,
-            _known(away.calibration_m / away.depth_m),
-            away.matching_m / away.depth_m,
+            away.depth_m, _known(away.calibration_m / away.depth_m), away.matching_m / away.depth_m
         ),
         rectified_focal_px=rectified_focal_px,
     )

@@ -346,6 +346,16 @@ def noise_sigma(grey: UInt8) -> float:
     return max(float(np.median(np.abs(mixed))) / (6.0 * 0.6745), LEAST_NOISE)
 
 
+def shows_texture(image: UInt8) -> bool:
+    """Return whether most of an image has more fine texture than noise.
+
+    Halving an image takes half of the noise of its pixels, but leaves texture what it is.
+    """
+    grey = to_grey(image)
+    small = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return noise_sigma(small) >= max(noise_sigma(grey), 2 * LEAST_NOISE)
+
+
 def quieted(left: UInt8, right: UInt8) -> tuple[UInt8, UInt8]:
     """Smooth both images (H, W) where noise hides what they show, as at night."""
     if noise_sigma(left) > _DROWNING and noise_sigma(right) > _DROWNING:

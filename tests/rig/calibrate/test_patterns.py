@@ -64,10 +64,24 @@ def test_tags_are_found_through_a_wide_lens_to_a_tenth_of_a_pixel(text):
         inside = ((truth > 3) & (truth < np.array(grey.shape[::-1]) - 4)).all(axis=1)
         found = find_board(grey, board)
         errors.append(found.pixels - truth[found.numbers])
-        # Known limit: half of the tags in one view, where this lens bends most.
-        assert len(found.numbers) >= 0.5 * inside.sum()
+        assert len(found.numbers) >= 0.9 * inside.sum()
     # Where the border has one bit, windows are half as wide.
     assert rms(errors) < (0.15 if board.legacy else 0.1)
+
+
+def test_small_and_blurred_tags_are_found_where_opencv_sees_none():
+    """Tags of 20 px, two pixels a bit, blurred by 1.3: a sheet of kalibr at 1.7 m from a EuRoC."""
+    distortion = np.array([-0.283, 0.0739, 1.9e-4, 1.8e-5])
+    matrix = np.array([[458.6, 0, 367.2], [0, 457.3, 248.4], [0, 0, 1]])
+    camera = CameraIntrinsics(matrix, distortion, 752, 480)
+    board = parse_board("aprilgrid:6x6:88mm:0.3")
+    T = facing(board, 0.1, -0.05, 0.35, 1.75 / max(board.size_m))
+    blurred = cv2.GaussianBlur(BoardRenderer(camera, board).render(T), (0, 0), 1.3)
+    noise = np.random.default_rng(2).normal(0, NOISE_DN, blurred.shape)
+    grey = np.clip(np.rint(blurred + noise), 0, 255).astype(np.uint8)
+    truth, found = project_raw(camera, apply(T, board.corners_m)), find_board(grey, board)
+    assert len(found.numbers) >= 0.9 * len(truth)
+    assert rms([found.pixels - truth[found.numbers]]) < 0.25
 
 
 def test_a_part_of_the_tags_is_enough_and_a_tag_shown_twice_is_kept_once():

@@ -49,8 +49,11 @@ def test_figures_and_files_are_those_of_the_rig_and_its_views(make_views, tmp_pa
     pixels = np.concatenate([view.seen[0].pixels for view in views])
     cells = {(int((u + 0.5) // 80), int((v + 0.5) // 80)) for u, v in pixels}
     assert found["coverage_left"] == len(cells) / 48
-    at = f"{spread.depths[0].depth_m:g}"  # of the board
-    assert min(away) < float(at) < max(away)
+    at = f"{spread.depths[0].depth_m:g}"
+    working_m = found["working_error"]["distance_m"]
+    # The nearest of 1, 2 and 5 times powers of ten.
+    for depth, ratio in ((spread.depths[0], 0.2), (spread.depths[-1], 2.0)):
+        assert abs(np.log(depth.depth_m / (ratio * working_m))) < np.log(1.6)
     assert found["depth_error_cm"][at]["high"] == pytest.approx(100 * spread.depths[0].high_m)
     for form in get_args(CalibrationForm):
         files = write_calibration(tmp_path / form / "rig.yaml", run, form)
@@ -97,7 +100,6 @@ def test_the_verdict_is_that_of_the_depth_error_at_the_working_distance(
         ({"coverage_right": 0.4}, "coverage", "40 % of the right"),
         ({"stereo_rms_px": 0.7}, "together", "worse than alone"),
         ({"epipolar_95_px": 1.4}, "rows", "1.40 px"),
-        ({"baseline_m": 12.0}, "baseline", "12 m: are the squares really 25 mm"),
     ],
 )
 def test_what_makes_the_forecast_doubtful_makes_it_usable_at_best(other, code, figure):
@@ -132,6 +134,10 @@ def test_what_was_left_out_is_noted_and_changes_no_verdict():
     assert verdict == "good"
     assert set(found) == {"square", "board", "dropped", "repeats"}
     assert found["repeats"].startswith("2 views with the board where another one has it")
+    for baseline_m in (0.004, 12.0):  # of an endoscope, and of a ship
+        verdict, found = judge(baseline_m=baseline_m)
+        assert (verdict, set(found)) == ("good", {"baseline"})
+        assert f"{baseline_m:g} m: are the squares really 25 mm" in found["baseline"]
 
 
 def test_a_lens_that_fits_as_well_with_fewer_coefficients_is_proposed_and_none_where_none_fits():
