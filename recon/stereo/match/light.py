@@ -2,7 +2,7 @@
 
 Gradients grow with light, and are what windows compare. What exposure and curve of a sensor do
 depends on the grey level alone, what a vignette does is smooth in the image: where both images,
-made small, match, these are fitted, and kept if gradients agree better with them.
+made small, match, these are fitted, and kept where more matches with them.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 
 from recon.core.values import Disparity, RectifiedPair
-from recon.core.values.arrays import Float32, Float64, Int64, UInt8
+from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.sad import match_small
-from recon.stereo.match.search import clipped_gradients
 
 # Difference of brightness (logarithm) that half of the blocks need: parallax alone makes half.
 _ALIKE: Final = 0.1
@@ -47,13 +46,13 @@ def even(pair: RectifiedPair) -> RectifiedPair:
     if np.median(np.abs(np.diff(np.log(np.add(few, 1.0)), axis=0))) < _ALIKE:
         return pair
     small, values = match_small(pair)
-    lit, found = small, None
-    for _ in range(2):  # what is as bright matches better
-        found = fit_light(small, match_small(lit)[1])
-        if found is None:
-            return pair
-        lit = replace(small, right=relit(small.right, found))
-    if _apart(lit, values) >= _apart(small, values):
+    found = fit_light(small, values)
+    if found is not None:
+        again = match_small(replace(small, right=relit(small.right, found)))[1]
+        # What is as bright matches better; of an offset gradients know nothing, and nothing does.
+        better = np.isfinite(again).sum() > np.isfinite(values).sum()
+        found = fit_light(small, again) if better else None
+    if found is None:
         return pair
     rgb = None if pair.right_rgb is None else relit(pair.right_rgb, found)
     return replace(pair, right=relit(pair.right, found), right_rgb=rgb)
@@ -64,7 +63,8 @@ def fit_light(pair: RectifiedPair, values: Float32) -> Float64 | None:
 
     ``values`` is the disparity, NaN = none; None where too little matches.
     """
-    v, u, at = _matched(values)
+    v, u = np.nonzero(np.isfinite(values))
+    at = np.clip(np.rint(u - values[v, u]).astype(np.int64), 0, values.shape[1] - 1)
     both = np.stack([pair.left[v, u], pair.right[v, at]]).astype(np.float64)
     fair = (both.min(axis=0) > _FAIR[0]) & (both.max(axis=0) < _FAIR[1])
     if fair.sum() < _LEAST_MATCHES:
@@ -78,23 +78,6 @@ def fit_light(pair: RectifiedPair, values: Float32) -> Float64 | None:
         # Cauchy's weights: what shines, or is matched wrongly, hardly counts.
         weight = 1 / (1 + ((ratio - found @ terms) / _MATCHING) ** 2)
     return found
-
-
-def _matched(values: Float32) -> tuple[Int64, Int64, Int64]:
-    """Return rows and columns of what matches in the left image, and columns in the right one."""
-    v, u = np.nonzero(np.isfinite(values))
-    at = np.clip(np.rint(u - values[v, u]).astype(np.int64), 0, values.shape[1] - 1)
-    return v, u, at
-
-
-def _apart(pair: RectifiedPair, values: Float32) -> float:
-    """Return by how much gradients of what matches differ, on average: an offset changes none."""
-    v, u, at = _matched(values)
-    left, right = (
-        clipped_gradients(each, range(len(values))).astype(np.int16)
-        for each in (pair.left, pair.right)
-    )
-    return float(np.abs(left[v, u] - right[v, at]).mean())
 
 
 def relit(image: UInt8, weights: Float64) -> UInt8:
