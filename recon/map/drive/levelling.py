@@ -51,8 +51,9 @@ def level_drive(
         off_deg = math.degrees(math.acos(np.clip(T_map_world[2, :3] @ up, -1.0, 1.0)))
         turned = off_deg > _SIGMAS * level.sigma_deg and session.ray_frames == len(session)
         level = level if turned else replace(level, sigma_deg=max(level.sigma_deg, off_deg))
-    if turned:  # the short way; what the origin is above stays so far below
-        T_map_world[:3, :3] = short_turn(T_map_world[:3, :3] @ up, UP_MAP) @ T_map_world[:3, :3]
+        if turned:  # the short way; what the origin is above stays so far below
+            R_map_world = T_map_world[:3, :3]
+            T_map_world[:3, :3] = short_turn(R_map_world @ up, UP_MAP) @ R_map_world
     # That too little was seen does not make the first frame wrong.
     session.level = before if level.why == TOO_FEW else level
     session.set_axes(T_map_world, session.camera)
