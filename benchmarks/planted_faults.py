@@ -24,8 +24,9 @@ from altered_drives import alterations, run
 from recon.commands.config import load_config
 from recon.core.values import StereoCalibration
 from recon.look.fault import NAMES, RigFault, without_fault
+from recon.look.fit import ROAD_DEPTH_M
 from recon.look.look import refine_rig
-from recon.look.rig import DEPTHS_M, RefinedRig, RigChange, compare_rigs
+from recon.look.rig import RefinedRig, RigChange, compare_rigs
 from recon.odometry.registry import make_odometry
 from recon.sources.registry import open_source
 from recon.sources.source import StereoSource
@@ -70,7 +71,7 @@ def measure(folder: Path, names: Sequence[str]) -> dict[str, dict[str, Any]]:
         wrong = planted(name, rig)
         again = refine_rig(drive.with_calibration(wrong), config, config.rig)
         before, after = (
-            moved_px(compare_rigs(one, rig, DEPTHS_M[0], config.rectification))
+            moved_px(compare_rigs(one, rig, ROAD_DEPTH_M, config.rectification))
             for one in (wrong, again.calibration)
         )
         found[name] = {

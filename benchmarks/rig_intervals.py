@@ -25,9 +25,9 @@ from recon.commands.config import load_config
 from recon.core.values import RectifiedCamera, Rig, StereoPair
 from recon.core.values.arrays import Float64, UInt8
 from recon.look.fault import NAMES, TURN, RigFault, spread_pixels, without_fault
-from recon.look.fit import FittedFault
+from recon.look.fit import ROAD_DEPTH_M, FittedFault
 from recon.look.look import refine_rig
-from recon.look.rig import DEPTHS_M, compare_rigs
+from recon.look.rig import compare_rigs
 from recon.odometry.protocol import OdometryFrame
 from recon.odometry.registry import make_odometry
 from recon.odometry.settings import RigSettings
@@ -111,7 +111,7 @@ def judge(drive: Planted) -> dict[str, Any] | None:
     if (fitted := rig.fitted) is None or (length_ratio := rig.length_ratio) is None:
         return None
     planted, left = (
-        compare_rigs(one, true, DEPTHS_M[0], config.rectification)
+        compare_rigs(one, true, ROAD_DEPTH_M, config.rectification)
         for one in (given, rig.calibration)
     )
     camera = turns_of(rig.calibration, config.rectification).camera

@@ -34,7 +34,7 @@ from recon.io.cameras.calibration import write_recon_calibration
 from recon.look.findings import Finding, find_faults
 from recon.look.length import check_length, see_baseline
 from recon.look.look import Look, look_at
-from recon.look.rig import DEPTHS_M, KnownRig, RefinedRig, rig_shown
+from recon.look.rig import KnownRig, RefinedRig, rig_shown
 from recon.map.drive.drive import Workspace
 from recon.map.drive.drive_odometry import doubt_poses
 from recon.map.drive.scale import SceneScale, measure_scene
@@ -301,7 +301,7 @@ def _shown_live(
 
 def _next_drive(source: StereoSource, config: ReconConfig, rig: RefinedRig) -> list[str]:
     """Return what to do about a rig that the drive was mapped with, and showed to be wrong."""
-    if not (source.live and config.rig.refine and rig.wrong_at(DEPTHS_M[0])):
+    if not (source.live and config.rig.refine and rig.wrong):
         return []
     return [f"{RIG_FILE} is the rig that this drive showed: the next one takes it with --calib"]
 

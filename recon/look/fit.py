@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import apply, invert
+from recon.core.text import round_lengths
 from recon.core.values import RectifiedCamera
 from recon.core.values.arrays import Bool, Float64
-from recon.core.values.camera import project
+from recon.core.values.camera import depth_from_disparity, project
 from recon.core.work import FEW, serial_algebra, side_by_side
 from recon.look.fault import Places, RigFault, shrink
 from recon.look.tracks import StereoTracks, turns
@@ -37,6 +38,7 @@ from recon.odometry.pose import (
     reprojection,
 )
 
+ROAD_DEPTH_M: Final = 10.0
 _ROUNDS: Final = 32  # times at most that all windows are adjusted, without the fault as known then
 _LAST_STEP: Final = 1.0  # length of a step, in standard deviations, after which there is no other
 _ROUNDING: Final = 1e-9  # fraction of the best known direction below which one is not known at all
@@ -68,6 +70,7 @@ class FittedFault:
     fixed: bool = True  # False: it turns with what is seen, as in stabilised images
     # standard deviation of the path's length without the fault, as a ratio; NaN = as the covariance
     length: float = float("nan")
+    depth_m: float = ROAD_DEPTH_M  # a typical one of what moved
 
 
 def fit_fault(
@@ -157,8 +160,17 @@ def fit_fault(
     apart = disagreement([_corrected(part, part.window, fault, used)[1] for part in parts], camera)
     length = float(np.sqrt(lengthening @ covariance @ lengthening + apart**2))
     covariance[np.ix_(rig, rig)] += off[:-1, :-1]
-    others = (time_offset, sigma, spread, fixed, length)
+    others = (time_offset, sigma, spread, fixed, length, _typical_depth(tracks, camera))
     return FittedFault(values[:-1], covariance, lengthening, scatter, len(tracks), *others)
+
+
+def _typical_depth(tracks: Sequence[StereoTracks], camera: RectifiedCamera) -> float:
+    """Return the median depth of features, of the series 1, 2, 5; of a road if it is not known."""
+    depth_m = depth_from_disparity(
+        np.concatenate([one.window.uvd[-1, :, 2] for one in tracks]), camera
+    )
+    known = depth_m[np.isfinite(depth_m)]
+    return round_lengths(*[float(np.median(known))] * 2)[0] if len(known) else ROAD_DEPTH_M
 
 
 def _by_likeness(

@@ -35,7 +35,7 @@ from recon.stereo.rectify.lens import project_raw
 from recon.stereo.rectify.rectifier import RectificationSettings, turns_of
 
 MIN_WINDOWS: Final = 6  # fewer windows do not show how much they contradict each other
-DEPTHS_M: Final = (10.0, 30.0)  # distances for which the depth error is stated
+DEPTHS: Final = (1.0, 3.0)  # times the typical one, for which the depth error is stated
 _PASSES: Final = 2  # a rig that was far off is matched, and fitted, once more
 _FAR_OFF_PX: Final = 1.0  # what features moved by, root mean square, if it was
 _LEAST_PX: Final = 0.05  # no matcher sees less; images are not warped for it
@@ -149,7 +149,7 @@ class RefinedRig:
     calibration: Rig  # to be used: that given where the drive shows no other, or it is to be kept
     camera: RectifiedCamera  # rectified views of the rig given
     fitted: FittedFault | None = None  # None: nothing was measured
-    changes: tuple[RigChange, ...] = ()  # at `DEPTHS_M`
+    changes: tuple[RigChange, ...] = ()  # at `DEPTHS`
     sigma_px: float = float("nan")  # of the mean disparity
     begun_with: str | None = None  # the drive whose rig this one began with
     period_s: float = float("nan")  # of frames; NaN = not known
@@ -242,6 +242,11 @@ class RefinedRig:
         return percent > MOST_DEPTH_PERCENT and self.changes[0].rms_px > 2.0 * self.sigma_px
 
     @property
+    def wrong(self) -> bool:
+        """Whether depth is off so far where most features are."""
+        return bool(self.changes) and self.wrong_at(self.changes[0].depth_m)
+
+    @property
     def late(self) -> str:
         """By how much right images are taken later than left ones, in words; "" if hardly."""
         fitted = self.fitted
@@ -304,12 +309,15 @@ class RefinedRig:
             lines.append(MOVES)
         if self.baseline is not None and self.baseline.ratio:
             lines.append(self.baseline.describe(used=self.refined))
-        if not self.wrong_at(DEPTHS_M[0]):
+        if not self.wrong:
             return lines
         shows = "the motion shows" if self.begun_with is None else f"{self.begun_with} showed"
         used = f"used is the rig that {shows} (--set rig.refine=off keeps the calibration)"
         used = used if self.refined else "used is the calibration as it is"
-        return [f"the rig is not as calibrated: {self.describe(DEPTHS_M[0])}; {used}", *lines]
+        return [
+            f"the rig is not as calibrated: {self.describe(self.changes[0].depth_m)}; {used}",
+            *lines,
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -370,7 +378,7 @@ def refine(
         fitted = fit_fault(tracks, RigFault(turns.camera), active(last), before, values)
         values = values + fitted.values
         refined, before = without_fault(last, turns, fitted.values), None
-        change = compare_rigs(last, refined, DEPTHS_M[-1], config.rectification)
+        change = compare_rigs(last, refined, DEPTHS[-1] * fitted.depth_m, config.rectification)
         if change.moved_px < _FAR_OFF_PX or not left:
             break
         tracks = seen.again(refined)
@@ -397,7 +405,7 @@ def _described(
 ) -> RefinedRig:
     """Return a rig with how it differs from the one given, which it is if nothing does."""
     camera = turns_of(given, settings).camera
-    changes = tuple(compare_rigs(given, refined, z, settings) for z in DEPTHS_M)
+    changes = tuple(compare_rigs(given, refined, z * fitted.depth_m, settings) for z in DEPTHS)
     rig = refined if changes[-1].moved_px > _LEAST_PX else given
     # How the mean disparity follows the parameters of the fault.
     uv = spread_pixels(camera, _FIELD)

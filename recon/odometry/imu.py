@@ -177,7 +177,8 @@ def find_up(gyro: Gyro, run: ImuSpan, arm_m: Float64) -> tuple[Float64 | None, f
     near = path.timestamps_s <= begin_s + _UP_SPAN_S
     ends_s = path.timestamps_s[near] - begin_s
     short = near.sum() < 4 or ends_s[-1] < _LEAST_SPAN_S
-    if short or not gyro.knows(begin_s, begin_s + ends_s[-1]):
+    lost = not np.isfinite(run.sigma_m[: near.sum() - 1]).all()
+    if short or lost or not gyro.knows(begin_s, begin_s + ends_s[-1]):
         return None, float("nan")
     times_s, speed = _integrated(gyro, begin_s, float(ends_s[-1]))
     fallen_m = _summed(speed, times_s)
@@ -198,25 +199,24 @@ def find_up(gyro: Gyro, run: ImuSpan, arm_m: Float64) -> tuple[Float64 | None, f
     return -gravity / np.linalg.norm(gravity), sigma_deg
 
 
-def up_of_drive(guide: ImuGuide, run: ImuSpan) -> tuple[Float64, float] | None:
+def up_of_drive(
+    guide: ImuGuide, path: Trajectory, sigma_m: Float64
+) -> tuple[Float64 | None, float]:
     """Return what is up (3,) in the axes of a path, all along it, and how well, degrees.
 
-    Of accelerations nothing is left on average; what the accelerometer is off stays. None = it is
-    not known anywhere.
+    ``sigma_m`` (N - 1,) are standard deviations of its steps. Of accelerations nothing is left on
+    average; what the accelerometer is off stays. None = it is not known anywhere.
     """
-    times_s, T = run.path.timestamps_s, run.path.T_world_camera
+    times_s, T, ups = path.timestamps_s, path.T_world_camera, []
     starts_s = np.arange(times_s[0], times_s[-1], _UP_SPAN_S)
-    ups = []
     for first in np.unique(np.searchsorted(times_s, starts_s)).tolist():
-        own = slice(first, int(np.searchsorted(times_s, times_s[first] + _UP_SPAN_S, "right")))
-        path = Trajectory(invert(T[first]) @ T[own], times_s[own])
-        steps = slice(first, first + len(path) - 1)
-        part = ImuSpan(path, run.sigma_m[steps], run.sigma_rad[steps])
-        up = find_up(guide.gyro, part, guide.arm_m)[0] if np.isfinite(part.sigma_m).all() else None
+        rest = Trajectory(invert(T[first]) @ T[first:], times_s[first:])
+        run = ImuSpan(rest, sigma_m[first:], np.zeros_like(sigma_m[first:]))
+        up, _ = find_up(guide.gyro, run, guide.arm_m)
         if up is not None:
             ups.append(T[first, :3, :3] @ up)
     if not ups:
-        return None
+        return None, float("nan")
     up = np.mean(ups, axis=0) / np.linalg.norm(np.mean(ups, axis=0))
     spread = np.sqrt(np.mean(1.0 - np.square(np.stack(ups) @ up)) / len(ups))
     return up, float(np.rad2deg(np.hypot(spread, _FORCE / _G)))

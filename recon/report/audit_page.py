@@ -41,12 +41,12 @@ def write_audit_page(
     ]
     depths_m, rig = found.get("depth_error_m"), found.get("rig_by_motion")
     at, off_m = middle_depth(depths_m) or ("", 0.0)
-    off_percent = rig["depth_percent"]["10"]["mean"] if rig else None
+    off_at, off = next(iter(rig["depth_percent"].items())) if rig else ("10", {"mean": None})
     figures = [
         ("Epipolar error (RMS)", known("{:.2f} px", found["epipolar_error_rms_px"])),
         ("Baseline", known("{:.4g} m", found["baseline_m"])),
         (f"Depth error at {at} m, by noise", "" if depths_m is None else length(off_m)),
-        ("Depth at 10 m, by the rig", known("{:+.1f} %", off_percent)),
+        (f"Depth at {off_at} m, by the rig", known("{:+.1f} %", off["mean"])),
     ]
     subtitle, texts = f"{source.description}, {lines['frames']}", [x.text for x in audit.findings]
     write_page(Page(f"Audit of {source.name}", subtitle, figures, sections, found, texts), run)

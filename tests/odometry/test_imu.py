@@ -75,14 +75,12 @@ FAULTS = {
 
 def test_up_is_found_all_along_a_path_whose_frames_are_partly_lost(record):
     fitted, run = fit_imu(record, FRAMES_S, seen, T_CAMERA_IMU), seen()[0]
-    up, sigma_deg = up_of_drive(fitted.guide, run)
+    up, sigma_deg = up_of_drive(fitted.guide, run.path, run.sigma_m)
     assert np.rad2deg(np.arccos(up @ UP)) < sigma_deg < 1.0
-    lost = replace(run, sigma_m=np.where(np.arange(len(run.sigma_m)) == 3, np.nan, run.sigma_m))
-    up, _ = up_of_drive(fitted.guide, lost)
+    lost = np.where(np.arange(len(run.sigma_m)) == 3, np.nan, run.sigma_m)
+    up, _ = up_of_drive(fitted.guide, run.path, lost)
     assert np.rad2deg(np.arccos(up @ UP)) < 1.0
-    assert (
-        up_of_drive(fitted.guide, replace(run, sigma_m=np.full_like(run.sigma_m, np.nan))) is None
-    )
+    assert up_of_drive(fitted.guide, run.path, np.full_like(lost, np.nan))[0] is None
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -22,7 +22,7 @@ from recon.core.values import (
 from recon.evaluation.map import DriveErrors
 from recon.look.fault import NAMES, RigFault
 from recon.look.fit import FittedFault
-from recon.look.rig import DEPTHS_M, RefinedRig, RigChange
+from recon.look.rig import DEPTHS, RefinedRig, RigChange
 from recon.odometry.protocol import OdometryHealth
 from recon.report.scene import T_UPRIGHT_CAMERA
 
@@ -118,7 +118,7 @@ def rig(pair):
     fitted = FittedFault(values, covariance, np.zeros(len(NAMES)), 1.0, 12)
     off_px = np.linspace(-2.0, -1.0, 32).reshape(4, 8)
     off_px[0, 0] = np.nan
-    changes = tuple(RigChange(z, off_px, np.full((4, 8), 0.25)) for z in DEPTHS_M)
+    changes = tuple(RigChange(10.0 * z, off_px, np.full((4, 8), 0.25)) for z in DEPTHS)
     return RefinedRig(camera, replace(camera), camera, fitted, changes, 0.05)
 
 

@@ -16,7 +16,7 @@ from recon.map.ground.level import TOO_FEW, Level, level_by_surfaces
 from recon.map.sessions.placed import CastSubmaps
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
-from recon.odometry.imu import ImuGuide, ImuSpan, up_of_drive
+from recon.odometry.imu import ImuGuide, up_of_drive
 
 _SIGMAS: Final = 3.0  # that axes are off before they are turned
 _MOST_SUBMAPS: Final = 40  # whose surfaces are looked at, all along the drive
@@ -38,35 +38,29 @@ def level_drive(
     if before.by == "setting" or math.isfinite(before.sigma_deg) or not placed.any():
         return
     up, level = None, before
+    path = session.trajectory.select(placed)
     if guide is not None:
-        up, level = _by_imu(session, placed, guide) or (up, level)
+        steps_m = [one.sigma_m for one, there in zip(session.health, placed, strict=True) if there]
+        up, sigma_deg = up_of_drive(guide, path, np.array(steps_m[1:]))
+        level = before if up is None else Level("imu", sigma_deg)
     if up is None and before.by not in ("imu", "robot"):
-        path = session.trajectory.T_world_camera[placed]
-        up, level = level_by_surfaces(_normals(session, settings, placed), path)
-    if up is None:  # that too little was seen does not make the first frame wrong
-        session.level = before if level.why == TOO_FEW else level
-        session.set_axes(session.T_map_world, session.camera)
-        return
-    off_deg = math.degrees(math.acos(np.clip(session.T_map_world[2, :3] @ up, -1.0, 1.0)))
-    turned = off_deg > _SIGMAS * level.sigma_deg and session.ray_frames == len(session)
-    session.level = level if turned else replace(level, sigma_deg=max(level.sigma_deg, off_deg))
-    T_map_world = session.T_map_world
-    if turned:  # the short way; what the origin is above stays so far below
-        T_map_world[:3, :3] = short_turn(T_map_world[:3, :3] @ up, UP_MAP) @ T_map_world[:3, :3]
+        normals = _normals(session, settings, placed)
+        up, level = level_by_surfaces(normals, path.T_world_camera)
+    T_map_world, turned = session.T_map_world, False
+    if up is not None:
+        off_deg = math.degrees(math.acos(np.clip(T_map_world[2, :3] @ up, -1.0, 1.0)))
+        turned = off_deg > _SIGMAS * level.sigma_deg and session.ray_frames == len(session)
+        level = level if turned else replace(level, sigma_deg=max(level.sigma_deg, off_deg))
+        if turned:  # the short way; what the origin is above stays so far below
+            R_map_world = T_map_world[:3, :3]
+            T_map_world[:3, :3] = short_turn(R_map_world @ up, UP_MAP) @ R_map_world
+    # That too little was seen does not make the first frame wrong.
+    session.level = before if level.why == TOO_FEW else level
     session.set_axes(T_map_world, session.camera)
     if turned:
         cast = CastSubmaps(session, settings)
         for submap in side_by_side(cast.__getitem__, range(len(cast)), threads=threads):
             session.submaps.add(submap)
-
-
-def _by_imu(session: Session, placed: Bool, guide: ImuGuide) -> tuple[Float64, Level] | None:
-    """Return what is up by an inertial unit; None = it does not know."""
-    health = [one for one, there in zip(session.health, placed, strict=True) if there]
-    sigma_m = np.array([one.sigma_m for one in health[1:]])
-    run = ImuSpan(session.trajectory.select(placed), sigma_m, np.zeros_like(sigma_m))
-    found = up_of_drive(guide, run)
-    return None if found is None else (found[0], Level("imu", found[1]))
 
 
 def _normals(session: Session, settings: DriveSettings, placed: Bool) -> Float64:

@@ -17,7 +17,8 @@ import numpy as np
 
 from recon.core.values.arrays import Float64
 
-_WITHIN_DEG: Final = 8.0  # of level or upright, what a garden still is
+_WITHIN: Final = math.radians(8.0)  # of level or upright, what a garden still is
+_NEAR, _LOW = math.cos(_WITHIN), math.sin(_WITHIN)  # components along up
 _DIRECTIONS: Final = 4000  # that are tried, 3° apart
 _MOST_NORMALS: Final = 20_000
 _LEAST_NORMALS: Final = 100  # of a part of the drive
@@ -25,7 +26,7 @@ _PARTS: Final = 8
 _MOST_SIGMA_DEG: Final = 3.0
 _SLOPE_DEG: Final = 1.0  # standard deviation of the slope of ground
 _TILT: Final = 0.75  # nats for each unit of 1 - cos of the angle to the camera's own up
-_DOUBTED_DEG: Final = 50.0  # a camera that is tilted more may as well look at a wall
+_DOUBTED: Final = math.cos(math.radians(50.0))  # tilted more, a camera may look at a wall
 _TURNED: Final = 0.5  # length of the mean of the camera's own up, below which it says nothing
 _CLIMBED: Final = 0.5  # part of the motion, squared, that is too much to be up a wall
 _DENSER: Final = 1.75  # times as many normals lie near a direction that is that of something flat
@@ -91,24 +92,21 @@ def _directions() -> Float64:
 
 def _likelihood(normals: Float64, ups: Float64) -> Float64:
     """Return by how much, in nats, normals facing up or sideways are no chance; (N,) of ``ups``."""
-    near, low = math.cos(math.radians(_WITHIN_DEG)), math.sin(math.radians(_WITHIN_DEG))
-    by_chance = np.array([(1.0 - near) / 2.0, low])
-    by_chance = np.append(by_chance, 1.0 - by_chance.sum())
-    found = []
-    for some in np.array_split(ups, 40):
-        cos = normals.astype(np.float32) @ some.T.astype(np.float32)
-        parts = np.stack([(cos > near).mean(axis=0), (abs(cos) < low).mean(axis=0)], axis=1)
-        parts = np.column_stack([parts, 1.0 - parts.sum(axis=1)])
-        found.append((parts * np.log(np.maximum(parts, 1e-9) / by_chance)).sum(axis=1))
-    return np.concatenate(found)
+    parts = np.empty((2, len(ups)))
+    for some in np.array_split(np.arange(len(ups)), 40):  # all at once are large
+        cos = normals.astype(np.float32) @ ups[some].T.astype(np.float32)
+        parts[:, some] = (cos > _NEAR).mean(axis=0), (abs(cos) < _LOW).mean(axis=0)
+    parts = np.vstack([parts, 1.0 - parts.sum(axis=0)])
+    level = (1.0 - _NEAR) / 2.0
+    by_chance = np.array([[level], [_LOW], [1.0 - level - _LOW]])
+    return np.asarray((parts * np.log(np.maximum(parts, 1e-9) / by_chance)).sum(axis=0))
 
 
 def _refined(normals: Float64, up: Float64) -> Float64:
     """Return the direction near ``up`` to which normals are most parallel or perpendicular."""
-    near, low = math.cos(math.radians(_WITHIN_DEG)), math.sin(math.radians(_WITHIN_DEG))
     for _ in range(10):
-        cos = normals @ up
-        level, upright = normals[np.abs(cos) > near], normals[np.abs(cos) < low]
+        cos = np.abs(normals @ up)
+        level, upright = normals[cos > _NEAR], normals[cos < _LOW]
         found = np.linalg.eigh(upright.T @ upright - level.T @ level)[1][:, 0]
         up = found * np.sign(found @ up)
     return up
@@ -118,22 +116,22 @@ def _doubt(normals: Float64, up: Float64, T_world_camera: Float64, held: Float64
     """Return why a direction may not be up although surfaces look as if, or nothing."""
     cos = normals @ up
     floor, ceiling = _stands_out(1.0 - cos), _stands_out(1.0 + cos)
-    walls = normals[np.abs(cos) < math.sin(math.radians(_WITHIN_DEG))]
+    walls = normals[np.abs(cos) < _LOW]
     alike = np.linalg.eigvalsh(walls.T @ walls)[1] < _ACROSS * len(walls)
     if not (floor or ceiling) and (alike or not _stands_out(np.abs(cos), math.sin)):
         return "surfaces are no more level or upright than anything else"
-    steady, doubted = float(np.linalg.norm(held)), math.cos(math.radians(_DOUBTED_DEG))
-    tilt = float(held @ up) / max(steady, 1e-9)
-    if tilt >= doubted or (steady < _TURNED and floor):
+    steady = float(np.linalg.norm(held))
+    upright = float(held @ up) / max(steady, 1e-9)  # cosine of the angle to the camera's own up
+    if upright >= _DOUBTED or (steady < _TURNED and floor):
         return ""
-    if tilt <= -doubted:
+    if upright <= -_DOUBTED:
         return "" if floor and not ceiling else "the camera seems upside down, and sees no ground"
     # Were the surface that seems to be the ground a wall, the camera would have climbed.
     climb = held - (held @ up) * up
     moved = np.diff(T_world_camera[:, :3, 3], axis=0)
     climbed = np.sum((moved @ climb) ** 2) / max(float(climb @ climb * np.sum(moved**2)), 1e-12)
-    known = floor and climbed > _CLIMBED
-    return "" if known else "the camera looks down at the ground, or at a wall"
+    sure = floor and climbed > _CLIMBED
+    return "" if sure else "the camera looks down at the ground, or at a wall"
 
 
 def _stands_out(away: Float64, of: Callable[[float], float] = lambda a: 1.0 - math.cos(a)) -> bool:
@@ -141,6 +139,6 @@ def _stands_out(away: Float64, of: Callable[[float], float] = lambda a: 1.0 - ma
 
     ``away`` (N,) grows evenly with the solid angle, which ``of`` gives of a distance in radians.
     """
-    near, far = of(math.radians(_WITHIN_DEG)), of(math.radians(2.0 * _WITHIN_DEG))
+    near, far = of(_WITHIN), of(2.0 * _WITHIN)
     inside, outside = float(np.mean(away < near)), float(np.mean((away >= near) & (away < far)))
     return inside > _LEAST_RATIO and inside * (far - near) > _DENSER * outside * near

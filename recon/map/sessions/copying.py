@@ -15,6 +15,7 @@ from recon.core.geometry.se3 import orthonormalise
 from recon.core.text import counted
 from recon.core.values.arrays import Float64
 from recon.map.builders import Submap
+from recon.map.ground.level import Level
 from recon.map.kernels import clamped
 from recon.map.occupancy.part import OccupancyPart
 from recon.map.sessions.joining import T_one_other, link_by_frame
@@ -87,7 +88,8 @@ def join_parts(
     for part_map, lead in parts:
         part, begin = part_map.session(), len(session) - lead
         if not len(session):
-            session.mount, session.level = part.mount, part.level
+            # How well it is level is found by the whole drive.
+            session.mount, session.level = part.mount, Level(part.level.by, why=part.level.why)
             session.set_axes(part.T_map_world, part.camera)
         detector = detector or LoopDetector(
             session.keyframes, part.camera, search=settings.loops.enabled, scale=settings.scale

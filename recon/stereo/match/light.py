@@ -2,7 +2,7 @@
 
 Gradients grow with light, and are what windows compare. What exposure and curve of a sensor do
 depends on the grey level alone, what a vignette does is smooth in the image: where both images,
-made small, match, these are fitted.
+made small, match, these are fitted, and kept where more matches with them.
 """
 
 from __future__ import annotations
@@ -47,8 +47,11 @@ def even(pair: RectifiedPair) -> RectifiedPair:
         return pair
     small, values = match_small(pair)
     found = fit_light(small, values)
-    if found is not None:  # What is as bright matches better.
-        found = fit_light(small, match_small(replace(small, right=relit(small.right, found)))[1])
+    if found is not None:
+        again = match_small(replace(small, right=relit(small.right, found)))[1]
+        # What is as bright matches better; of an offset gradients know nothing, and nothing does.
+        better = np.isfinite(again).sum() > np.isfinite(values).sum()
+        found = fit_light(small, again) if better else None
     if found is None:
         return pair
     rgb = None if pair.right_rgb is None else relit(pair.right_rgb, found)
