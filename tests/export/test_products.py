@@ -242,7 +242,7 @@ def test_a_map_that_is_not_level_is_said_to_be_steep(mapped, monkeypatch):
 
     monkeypatch.setattr(mapper, "map_axes", lay_badly)
     short = SyntheticSource(STREET.model_copy(update={"frames": 8}))
-    steep = map_sequence(short, load_config(None, SETTINGS))
+    steep = map_sequence(short, load_config(None, [*SETTINGS, "axes.up=[0,-1,0]"]))
     _, warnings = make_costmap(steep.map, steep.placed)
     assert any(re.search(r"\d+ % of the ground .*robot\.max_slope_percent=20", w) for w in warnings)
     assert not any("steeper" in w for w in make_costmap(mapped.map, mapped.placed)[1])

@@ -23,7 +23,7 @@ from tests.scenery.film import Film
 from tests.scenery.kitti import write_kitti
 
 CODE = Path(recon.__file__).parent
-MOST_FILES = 29
+MOST_FILES = 30
 FOLLOWED = 5
 """The pair that is followed: features, submap and a keyframe are there by then."""
 

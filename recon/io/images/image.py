@@ -405,8 +405,11 @@ def read_focal_length(path: StrPath, width_px: int, height_px: int) -> ExifFocal
 def read_orientation(path: StrPath) -> int:
     """Return the EXIF orientation of a JPEG, 1 to 8; 1 = as stored, also where none is known."""
     try:
-        with _silent_pillow(), reading(path), Image.open(path, formats=("JPEG",)) as image:
-            found = image.getexif().get(_ORIENTATION, 1)
+        with reading(path), Path(path).open("rb") as file:
+            if file.read(len(_JPEG_START)) != _JPEG_START:
+                return 1
+            with _silent_pillow(), Image.open(file, formats=("JPEG",)) as image:
+                found = image.getexif().get(_ORIENTATION, 1)
     except FormatError:
         return 1
     return found if found in range(1, 9) else 1

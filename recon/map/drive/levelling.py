@@ -12,7 +12,7 @@ from recon.core.geometry.se3 import rotate
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import side_by_side
 from recon.map.ground.axes import UP_MAP, short_turn
-from recon.map.ground.level import TOO_FEW, Level, level_by_surfaces
+from recon.map.ground.level import LEVEL_DEG, TOO_FEW, Level, level_by_surfaces
 from recon.map.sessions.placed import CastSubmaps
 from recon.map.settings import DriveSettings
 from recon.map.store.session import Session
@@ -31,8 +31,9 @@ def level_drive(
 ) -> None:
     """Find what is up by the frames of a drive that have a place in its map, ``placed`` (N,).
 
-    Where its axes are off by more than is known so well, they are turned, and occupancy is made
-    again of its rays. What is set or a robot says stays, but for what an inertial unit says.
+    Where its axes are off by more than is known so well, of surfaces by more than what still counts
+    as level, they are turned, and occupancy is made again of its rays. What is set or a robot says
+    stays, but for what an inertial unit says.
     """
     before = session.level
     if before.by == "setting" or math.isfinite(before.sigma_deg) or not placed.any():
@@ -49,7 +50,10 @@ def level_drive(
     T_map_world, turned = session.T_map_world, False
     if up is not None:
         off_deg = math.degrees(math.acos(np.clip(T_map_world[2, :3] @ up, -1.0, 1.0)))
-        turned = off_deg > _SIGMAS * level.sigma_deg and session.ray_frames == len(session)
+        # What depth errs in leans normals of a floor, alike in all frames, by some degrees.
+        least_deg = LEVEL_DEG if level.by == "surfaces" else 0.0
+        certain = off_deg > max(_SIGMAS * level.sigma_deg, least_deg)
+        turned = certain and session.ray_frames == len(session)
         level = level if turned else replace(level, sigma_deg=max(level.sigma_deg, off_deg))
         if turned:  # the short way; what the origin is above stays so far below
             R_map_world = T_map_world[:3, :3]

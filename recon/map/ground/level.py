@@ -17,7 +17,8 @@ import numpy as np
 
 from recon.core.values.arrays import Float64
 
-_WITHIN: Final = math.radians(8.0)  # of level or upright, what a garden still is
+LEVEL_DEG: Final = 8.0  # of level or upright, what a garden still is
+_WITHIN: Final = math.radians(LEVEL_DEG)
 _NEAR, _LOW = math.cos(_WITHIN), math.sin(_WITHIN)  # components along up
 _DIRECTIONS: Final = 4000  # that are tried, 3° apart
 _MOST_NORMALS: Final = 20_000
