@@ -336,7 +336,6 @@ def recordings(found: Found) -> Rows:
             "ATE": centimetres(one),
             "precision": one.get("precision"),
             "recall": one.get("recall"),
-            "seconds": one.get("seconds"),
             "ORB-SLAM3": None if refusal else peer_cell(peers["ORB-SLAM3"]),
             "COLMAP": None if peers["COLMAP"] is None else centimetres(peers["COLMAP"]),
         }

@@ -318,10 +318,9 @@ TABLES: Final[dict[str, Table]] = {
     "recordings": Table(
         {"recordings": "python benchmarks/recordings.py $RECON_DATA --json"},
         dict.fromkeys(("camera", "map", "not trusted", "ATE"), "{}")
-        | {"precision": SHARE, "recall": SHARE, "seconds": "{:.0f}"}
+        | {"precision": SHARE, "recall": SHARE}
         | dict.fromkeys(("ORB-SLAM3", "COLMAP"), "{}"),
         rows_of.recordings,
-        timed=True,
     ),
     "surfaces": Table(
         {
