@@ -220,7 +220,8 @@ def test_a_drive_is_found_in_a_map_and_who_comes_late_gets_the_grid(mapped, driv
             for messages in network.receive(lambda: bool(late) or time.monotonic() > end_s):
                 late.extend(messages)
 
-    with listening() as listener, played(drive, "--compressed") as over:
+    # Slowly: a busy machine localises two frames a second, and frames that it drops are not found.
+    with listening() as listener, played(drive, "--compressed", "--rate", "0.2") as over:
         joiner = threading.Thread(target=join, args=(over,), daemon=True)
         joiner.start()
         summary = live(
