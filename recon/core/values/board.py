@@ -18,7 +18,7 @@ BoardKind = Literal["chess", "charuco", "aprilgrid", "circles", "acircles"]
 class _Kind:
     """What is known of a kind of board: how it is written, and where its corners are."""
 
-    form: str
+    form: str  # an example, and what is in it
     less: int  # by how much corners are fewer than columns and rows
     each: int  # corners along one side of a column
     said: str  # what the given length is of
@@ -31,25 +31,22 @@ class _Kind:
 
 _KINDS: Final[dict[str, _Kind]] = {
     "chess": _Kind(
-        "chess:COLUMNSxROWS:SQUARE (inner corners, such as chess:9x6:25mm)", 0, 1, "squares"
+        "chess:9x6:25mm (inner corners, square)", 0, 1, "squares"
     ),
     "charuco": _Kind(
-        "charuco:COLUMNSxROWS:SQUARE[:MARKER[:DICTIONARY]] "
-        "(squares, such as charuco:8x6:30mm:22mm:5x5_100)",
+        "charuco:8x6:30mm:22mm:5x5_100 (squares, square, marker)",
         1, 1, "squares", 3, 0.75, "5X5_100", True, "legacy",
     ),
     "aprilgrid": _Kind(
-        "aprilgrid:COLUMNSxROWS:TAG[:GAP] (tags, and the gap between them relative to a tag, such "
-        "as aprilgrid:6x6:88mm:0.3)",
+        "aprilgrid:6x6:88mm:0.3 (tags, tag, gap relative to it)",
         0, 2, "tags", 2, 0.3, "APRILTAG_36H11", True, "thin",
     ),
     "circles": _Kind(
-        "circles:COLUMNSxROWS:STEP[:DIAMETER] (circles, such as circles:7x6:20mm:10mm)",
+        "circles:7x6:20mm:10mm (circles, step, diameter)",
         0, 1, "steps", 2, 0.4,
     ),
     "acircles": _Kind(
-        "acircles:COLUMNSxROWS:STEP[:DIAMETER] (every other row is one step to the right, such as "
-        "acircles:4x11:20mm:16mm)",
+        "acircles:4x11:20mm:16mm (every other row a step to the right)",
         0, 1, "steps", 2, 0.4,
     ),
 }  # fmt: skip
