@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise, repeat
+from itertools import chain, pairwise, repeat
 from typing import Final
 
 import numpy as np
@@ -26,6 +26,8 @@ _WALL_M: Final = 8.2  # distance of facades from the centre line
 _AHEAD_M: Final = 110.0
 _CAR_LANE_M: Final = 4.15
 _SEEDLINGS: Final = 5
+Layer = Callable[[CentreLine, float, np.random.Generator], Iterator[TriangleSoup]]
+"""Lays out what stands on one side of a road: +1 is left."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,19 +77,8 @@ def build_street(settings: StreetSettings) -> StreetWorld:
         road = room_lap(settings)
         soup, poses = furnished_room(settings, road), hand_poses(settings, road)
         return StreetWorld(settings, soup, rig(settings), poses, _sun(settings.seed))
-    length = settings.frames * settings.speed_m_per_frame + _AHEAD_M
-    road = centre_line(settings, length + 60.0)
-    layers: list[Callable[[CentreLine, float, np.random.Generator], Iterator[TriangleSoup]]] = [
-        _houses,
-        _backdrop,
-        *([_fences, _trees] if settings.fences else [_parked_cars, _trees, _furniture]),
-    ]
-    parts = [_ground(road)]
-    for number, layer in enumerate(layers):
-        for side in (1.0, -1.0):
-            stream = np.random.default_rng([settings.seed, number, int(side > 0)])
-            parts.extend(layer(road, side, stream))
-    soup = merge(parts)
+    road, length = _road(settings)
+    soup = merge(chain.from_iterable(street_parts(settings).values()))
     return StreetWorld(
         settings=settings,
         soup=soup if settings.repeat_m is None else _repeated(soup, settings.repeat_m, length),
@@ -95,6 +86,29 @@ def build_street(settings: StreetSettings) -> StreetWorld:
         T_street_camera=camera_poses(settings, road),
         to_sun=_sun(settings.seed),
     )
+
+
+def street_parts(settings: StreetScene) -> dict[str, list[TriangleSoup]]:
+    """Return what stands along a street by its kind, such as ``parked_cars``; street axes."""
+    road, _ = _road(settings)
+    layers: list[Layer] = [
+        _houses,
+        _backdrop,
+        *([_fences, _trees] if settings.fences else [_parked_cars, _trees, _furniture]),
+    ]
+    parts = {"ground": [_ground(road)]}
+    for number, layer in enumerate(layers):
+        found = parts[layer.__name__.strip("_")] = []
+        for side in (1.0, -1.0):
+            stream = np.random.default_rng([settings.seed, number, int(side > 0)])
+            found.extend(layer(road, side, stream))
+    return parts
+
+
+def _road(settings: StreetScene) -> tuple[CentreLine, float]:
+    """Return the road of a street, and how long it is."""
+    length = settings.frames * settings.speed_m_per_frame + _AHEAD_M
+    return centre_line(settings, length + 60.0), length
 
 
 def _repeated(period: TriangleSoup, repeat_m: float, length_m: float) -> TriangleSoup:
