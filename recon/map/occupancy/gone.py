@@ -64,8 +64,9 @@ def texture_of(image: UInt8, valid: Bool | None) -> UInt8:
 
 def find_gone(voxels: OccupancyVoxels, views: Iterable[FrameView]) -> Bool:
     """Return bool (N,), the voxels that left, by the views of all frames near, in their order."""
-    places = voxels.centres_m
-    hits, texture_sum, state = np.zeros((3, len(voxels)))
+    occupied = np.flatnonzero(voxels.log_odds > 0)  # some per cent: others cannot leave
+    places, gone = voxels.centres_m[occupied], np.zeros(len(voxels), np.bool_)
+    hits, texture_sum, state = np.zeros((3, len(places)))
     seen_from = np.ones_like(places)  # from where each was hit last, relative to it
     low, high, hit_more, missed = map(log_odds, _PROBABILITIES)
     for rays, T, camera in views:
@@ -87,7 +88,8 @@ def find_gone(voxels: OccupancyVoxels, views: Iterable[FrameView]) -> Bool:
         rows = rows[less & ~seen & (hits[rows] > 0) & (before[cell] < inverse - off)]
         rows = rows[_alike(T[:3, 3] - places[rows], seen_from[rows])]
         state[rows] = np.maximum(state[rows] + missed, low)
-    return np.asarray((voxels.log_odds > 0) & (hits > 0) & (state <= 0))
+    gone[occupied] = (hits > 0) & (state <= 0)
+    return gone
 
 
 def _alike(now: Float64, last: Float64) -> Bool:
