@@ -34,6 +34,30 @@ def _length(text: str) -> dict[str, Any]:
     return {"source.length": list(numbers)}
 
 
+def _check_into(
+    into: Path | None,
+    source: Path | None,
+    *,
+    remove: int | None,
+    keep: list[str] | None,
+    alone: tuple[Path | None, Path | None],
+    pieces: tuple[Any, Any],
+) -> None:
+    """Refuse options that do not go with --into RUN, or nowhere else."""
+    if into is None and keep:
+        raise typer.BadParameter("--keep says what the map of --into RUN keeps")
+    if remove is not None and (into is None or source is not None):
+        raise typer.BadParameter("--remove takes a session out of --into RUN, and maps no SOURCE")
+    if into is None:
+        return
+    if alone != (None, None):
+        raise typer.BadParameter("--into changes RUN, whole or not at all: no --out, no --resume")
+    if source is None and remove is None and not keep:
+        raise typer.BadParameter("--into RUN takes SOURCE, --remove SESSION or --keep")
+    if pieces != (None, None):
+        raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
+
+
 @opt.takes_groups
 def map_(
     source: Annotated[Path | None, typer.Argument(help=opt.SOURCES_HELP)] = None,
@@ -80,6 +104,23 @@ def map_(
         int | None,
         opt.option("With --into, without SOURCE: take a drive out of its map.", metavar="SESSION"),
     ] = None,
+    keep: Annotated[
+        list[str] | None,
+        opt.option(
+            "With --into: what the map keeps. N: of each place the newest N drives, and what only "
+            "older ones saw; 90d: drives up to 90 days older than the newest; X0,Y0,X1,Y1: what "
+            "lies there, in map metres; all. May be repeated.",
+            metavar="N|DAYS|REGION|all",
+            default="2 with SOURCE, else all",
+        ),
+    ] = None,
+    date: Annotated[
+        str | None,
+        opt.option(
+            "Day of the drive, UTC, such as 2026-11-30 or 2026-11-30T14:05.",
+            default="by stamps or files",
+        ),
+    ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
     view: View = False,
@@ -104,19 +145,17 @@ def map_(
       recon map rides/long --workers 4
       recon map rides/tomorrow --into outputs/map/latest
       recon map --into outputs/map/latest --remove 1
+      recon map --into outputs/map/latest --keep 2 --keep 90d
     """
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     if out is not None and resume is not None and os.path.realpath(out) != os.path.realpath(resume):
         raise typer.BadParameter("--out and --resume name different folders")
-    if into is not None and (resume is not None or out is not None):
-        raise typer.BadParameter("--into changes RUN, whole or not at all: no --out, no --resume")
-    if remove is not None and (into is None or source is not None):
-        raise typer.BadParameter("--remove takes a session out of --into RUN, and maps no SOURCE")
-    if source is None and resume is None and remove is None:
-        raise typer.BadParameter("give SOURCE, or --resume FOLDER")
-    if into is not None and (workers or scheduler) is not None:
-        raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
+    _check_into(
+        into, source, remove=remove, keep=keep, alone=(out, resume), pieces=(workers, scheduler)
+    )
+    if source is None and (date is not None or (resume is None and into is None)):
+        raise typer.BadParameter("give SOURCE, or --resume FOLDER, which has its --date")
     if view and (into or workers or scheduler) is not None:
         raise typer.BadParameter("--view follows one map that grows: no --into, --workers")
     with shared.one_line_errors():
@@ -124,6 +163,8 @@ def map_(
         from recon.commands.config import run_settings
         from recon.commands.map import run_map
         from recon.commands.merge import run_map_into, run_remove
+        from recon.core.dates import given_date
+        from recon.map.sessions.keep import Keep
 
         options = shared.options(
             out=out,
@@ -135,19 +176,21 @@ def map_(
             kind=reading.kind,
             poses_file=poses,
             prior_from=prior,
+            keep=Keep.parse(keep, "--keep") if keep else None,
+            date=None if date is None else given_date(date, "--date"),
         )
         if resume is not None:
             options, settings = options.resumed(
                 resume, shared.config, shared.changes, preset=shared.preset
             )
         elif into is not None:
-            of_the_source = () if remove is not None else ("source",)
+            of_the_source = () if source is None else ("source",)
             settings = run_settings(
                 into, shared.config, shared.changes, of_the_source, preset=shared.preset
             )
         else:
             settings = shared.settings()
-        if into is not None and remove is not None:
+        if into is not None and source is None:
             shown: RunSummary = run_remove(into, remove, settings, options)
         else:
             drive, options = open_drive(options, settings, shared)

@@ -6,7 +6,7 @@ import errno
 import math
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -162,6 +162,8 @@ def run_map(
         with run.stage("write"):
             export_paths(map_.first, mapped.joined, made.T_base_camera, run.content)
             keep_map(map_, run.path(MAP_FILE))
+            with closing(Map.open(run.path(MAP_FILE))) as kept:
+                summary = replace(summary, map_mb_per_km=kept.mb_per_km)
         with run.report(summary) as summary:
             # Its figures take long to load, and the drive is mapped without them.
             from recon.report.map_page import map_page  # noqa: PLC0415
@@ -368,6 +370,9 @@ def _summary(
         reach_m=reach_m,
         reach_error_m=nominal_error_m(reach_m, mapped.camera),
         typical_depth_m=depth_m,
+        date=mapped.session.date.text,
+        date_from=mapped.session.date.known_from,
+        map_mb_per_km=None,  # the file is written when all else is done
         made=UsualProducts.of(made),
         rig=rig.figures(),
         loops=None if mapped.loops is None else mapped.loops.figures(),

@@ -18,6 +18,7 @@ import numpy as np
 from typing_extensions import Self
 
 from recon.commands.config import Changes, ReconConfig, load_config
+from recon.core.dates import Date
 from recon.core.errors import FormatError, OutputError, ReconError, SettingsError
 from recon.core.geometry.se3 import make_transform
 from recon.core.machine import versions
@@ -32,6 +33,7 @@ from recon.io.trajectory import read_trajectory
 from recon.map.drive.drive import ANEW, resuming, session_info
 from recon.map.listener import NOBODY, DriveListener
 from recon.map.map import Map
+from recon.map.sessions.keep import Keep
 from recon.map.store.session import IMAGES
 from recon.run.batch.cluster import BatchOptions
 from recon.run.directory import RECORD, STARTED, state_folder
@@ -71,6 +73,8 @@ class MapOptions:
         writers: Where topics of a robot are written while it goes on, see `RobotTopics`.
         namespace: What the names of its topics and frames begin with.
         stamp_ns: Makes their stamps of the times of frames; None = they are seconds since 1970.
+        keep: What a map keeps of its drives, into which another is mapped; None = the default.
+        date: Day of the drive, where the user gives it; None = by its stamps or files.
         bag: Whether they are written into a bag in the folder of the run, too.
     """
 
@@ -95,6 +99,8 @@ class MapOptions:
     namespace: str = ""
     stamp_ns: Callable[[float], int] | None = None
     bag: bool = False
+    keep: Keep | None = None
+    date: Date | None = None
 
     @property
     def products(self) -> tuple[str, ...]:
@@ -211,7 +217,7 @@ class MapOptions:
         map_ = Map.create(path, cache_bytes=memory)
         # What arrives in its own time will not arrive again.
         start = {"identity": identity, "arguments": self.arguments, **images}
-        map_.begin(session_info(source, config, {} if source.live else start))
+        map_.begin(session_info(source, config, {} if source.live else start, self.date))
         map_.commit()
         run.begun = run.command != "demo"  # whose street no command line names
         return map_

@@ -11,10 +11,12 @@ from typing import Final
 
 from typing_extensions import Self
 
+from recon.core.dates import DateFrom
 from recon.core.summary import (
     Figures,
     Rows,
     RunSummary,
+    hidden,
     inline,
     inline_each,
     named,
@@ -35,6 +37,7 @@ from recon.map.drive.drive_loops import LoopFigures
 from recon.map.drive.drive_odometry import UsedPrior
 from recon.map.drive.sequence import DriveSegment
 from recon.map.sessions.georeference import SurveyFigures
+from recon.map.store.trees import Forgotten
 from recon.odometry.imu_fit import ImuFigures
 from recon.odometry.sfm import SfmFigures
 from recon.sources.source import SourceFigures
@@ -100,6 +103,9 @@ class MapSummary(RunSummary):
     reach_m: float  # depth up to which points are fused; infinite = any
     reach_error_m: float  # of a depth there, in one frame, by a matching error of 0.3 px
     typical_depth_m: float | None
+    date: str  # of the first image, UTC; "" = not known
+    date_from: DateFrom
+    map_mb_per_km: float | None  # size of map.recon, by the path
     made: UsualProducts = inline()
     rig: RigFigures
     loops: LoopFigures | None = optional()
@@ -170,6 +176,10 @@ class JoinedDrive(Figures):
     frames_placed: int
     positions: int  # measured positions that constrain it
     rig: RigFigures | None  # None = its motion was not looked at
+    date: str  # of its first image, UTC; "" = not known
+    date_from: DateFrom
+    rays_kept: float  # fraction of them that newer drives did not see again
+    keyframes_kept: float
 
 
 @dataclass(frozen=True)
@@ -190,6 +200,9 @@ class JoinedSummary(RunSummary):
     sessions: Sequence[JoinedDrive]
     links: LinkFigures
     positions_misfit_rms_m: float | None  # None = no position was measured
+    forgotten: Sequence[Forgotten]  # drives that left the map, since it was made
+    map_mb_per_km: float | None  # size of map.recon, by the paths of the drives in it
+    tended: str | None = hidden(None)  # what was forgotten now; None = nothing was to be
     made: UsualProducts = inline()
     T_map_world: Float64  # (4, 4)
 
@@ -201,11 +214,14 @@ class JoinedSummary(RunSummary):
         off = "" if misfit_m is None else f"{metres(misfit_m)} off measured positions (RMS)"
         held = ", ".join(text for text in (places if drives > 1 else "", off) if text)
         path = f"{counted(self.frames, 'frame')}, {metres(self.path_length_m)} of path"
+        full = bool(self.tended and self.made.mesh.faces)
         return [
             (f"map of {linked}{apart} {'drive' if drives == 1 else 'drives'}, {path}",),
             *self.folder_row(),
             *self.made.rows(),
-            *([("links" if drives > 1 else "survey", held)] if held else []),
+            *([("forgot", f"{self.tended}: newer drives saw the same")] if self.tended else []),
+            # Eight lines: what was forgotten is news.
+            *([("links" if drives > 1 else "survey", held)] if held and not full else []),
             *self.cost_row(),
             ("next", self.open_view()),
         ]

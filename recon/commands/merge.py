@@ -17,7 +17,12 @@ import numpy as np
 from recon.commands.config import REMADE, ReconConfig, check_changes, run_settings
 from recon.commands.map import look_first, map_drive
 from recon.commands.map_options import MapOptions
-from recon.commands.map_summary import JoinedDrive, JoinedSummary, LinkFigures, UsualProducts
+from recon.commands.map_summary import (
+    JoinedDrive,
+    JoinedSummary,
+    LinkFigures,
+    UsualProducts,
+)
 from recon.core.errors import FormatError, ReconError, SettingsError
 from recon.export.make import make
 from recon.export.product import ExportContext
@@ -29,8 +34,10 @@ from recon.map.drive.sequence import check_map
 from recon.map.map import Map
 from recon.map.sessions.copying import check_session, copy_sessions, keep_map, read_all
 from recon.map.sessions.joining import doubts_of_lengths, join_new
+from recon.map.sessions.keep import DRIVES, Keep
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
 from recon.map.sessions.placed import place_map, settings_of
+from recon.map.sessions.tending import Tended, forgotten_of, tend
 from recon.map.store.map_file import MAP_FILE
 from recon.map.store.session import Session
 from recon.report.map_page import write_joined_page
@@ -92,6 +99,9 @@ def run_map_into(
 ) -> JoinedSummary:
     """Map a drive into the map of a finished run: what `recon map SOURCE --into RUN` does.
 
+    What of older drives newer ones saw again is forgotten, as far as ``options.keep`` says; None =
+    as `DRIVES` does, ``Keep()`` keeps all.
+
     The folder is replaced in one step when all is done; until then it keeps the run as it was.
     The settings are those of the run, perhaps with changes; options are as for `run_map`.
     """
@@ -105,7 +115,7 @@ def run_map_into(
         rig, drive_settings = seen.rig, seen.shifted(settings)
         with Map.create(run.state("drive.recon")) as drive:
             images = options.images_of(seen.look.source)
-            drive.begin(session_info(seen.look.source, drive_settings, images))
+            drive.begin(session_info(seen.look.source, drive_settings, images, options.date))
             mapped = map_drive(seen.drive, drive_settings, options, run, drive)
             check_map(mapped, source.name, seen.look.first)
             if settings.rig.refine:
@@ -117,23 +127,27 @@ def run_map_into(
             raise error.copy_with(where=source.name) from error
 
     files = [folder / MAP_FILE, *source.files]
+    options = replace(options, keep=options.keep or Keep(DRIVES))
     return _make_joined(options, settings, fill, files, replaced=folder)
 
 
 def run_remove(
-    folder: Path, number: int, config: ReconConfig | None, options: MapOptions
+    folder: Path, number: int | None, config: ReconConfig | None, options: MapOptions
 ) -> JoinedSummary:
     """Take a drive out of the map of a run: what `recon map --into RUN --remove SESSION` does.
 
-    Its number is that of ``sessions`` in the summary; the folder is replaced in one step.
+    Its number is that of ``sessions`` in the summary (None = none is taken out); then the map
+    keeps what ``options.keep`` says (None = all). The folder is replaced in one step.
     """
     settings = _settings(folder, config)
 
     def fill(run: Run, map_: Map) -> list[int]:
         with closing(Map.open(folder)) as old:
-            if old.session(number) and len(old.sessions) < 2:
+            without = [] if number is None else [old.session(number)]
+            if without and len(old.sessions) < 2:
                 raise SettingsError("the map has only this session", where=folder, got=number)
-            copy_sessions(old, map_, without=[number])
+            copy_sessions(old, map_, without=[session.number for session in without])
+            map_.set_forgotten([*map_.forgotten, *(forgotten_of(session) for session in without)])
         return []
 
     return _make_joined(options, settings, fill, [folder / MAP_FILE], replaced=folder)
@@ -158,13 +172,18 @@ def _make_joined(
         left_out = [] if survey is None else hold(map_, survey)
         with run.stage("links"):
             join_new(map_, new)
+        tended = None
+        if options.keep not in (None, Keep()):
+            with run.stage("forget"):
+                tended = tend(map_, settings, options.keep)
         map_.commit()
+        map_.store.compact()
         with run.stage("map"):
             placed = place_map(map_, settings, run.threads)
         context = ExportContext(map_, placed, settings.mesh, threads=run.threads)
         made = make(context, run.content, options.products, run.watch)
         summary = replace(
-            _figures(map_, UsualProducts.of(made)),
+            _figures(map_, UsualProducts.of(made), tended),
             warnings=[*left_out, *_warnings(map_), *_of_rigs(map_, new), *made.warnings],
         )
         export_sessions(map_, run.content)
@@ -176,7 +195,7 @@ def _make_joined(
         return run.finish(summary, source=names, inputs=inputs, record=record)
 
 
-def _figures(map_: Map, made: UsualProducts) -> JoinedSummary:
+def _figures(map_: Map, made: UsualProducts, tended: Tended | None) -> JoinedSummary:
     placed = map_.placed
     kept = [link for link in map_.links if link.kept]
     pairs = Counter("-".join(map(str, link.sessions)) for link in kept)
@@ -194,9 +213,16 @@ def _figures(map_: Map, made: UsualProducts) -> JoinedSummary:
                 frames_placed=int(placed.get(session.number, np.zeros(0)).sum()),
                 positions=len(session.fixes),
                 rig=None if (rig := _rig_of(session)) is None else rig.figures(),
+                date=session.date.text,
+                date_from=session.date.known_from,
+                rays_kept=1.0 if (left := session.thinned) is None else left.rays_ratio,
+                keyframes_kept=1.0 if left is None else left.keyframes_ratio,
             )
             for session in map_.sessions
         ],
+        forgotten=map_.forgotten,
+        map_mb_per_km=map_.mb_per_km,
+        tended=None if tended is None else tended.text,
         links=LinkFigures(len(kept), len(map_.links) - len(kept), pairs),
         positions_misfit_rms_m=misfit_rms_m(map_),
         made=made,

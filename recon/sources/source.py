@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
+from recon.core.dates import Date, date_of_stamp
 from recon.core.errors import SourceError
 from recon.core.summary import Figures, optional
 from recon.core.text import counted, is_count
@@ -268,6 +269,26 @@ _SAMPLES: Final = 32  # of a file: a change over a 31st of it is seen, and all o
 def mark_of(source: StereoSource) -> dict[str, Any]:
     """Return what a source is known again by: number of pairs, names and samples of its files."""
     return {"frames": len(source), **fingerprint(source.files, samples=_SAMPLES)}
+
+
+_TEXTS: Final = frozenset((".txt", ".csv", ".json", ".toml", ".xml", ".yaml", ".yml"))
+
+
+def date_of(source: StereoSource) -> Date:
+    """Return when a drive began, by its first stamp, or else by the time of its first images.
+
+    That of a file may be the time of a copy, and is none of the drive's where files have no times.
+    """
+    stamps_s = source.stamps_s
+    if stamps_s is not None and len(stamps_s):
+        found = date_of_stamp(float(stamps_s[0]))
+        if found.text:
+            return found
+    images = (file for file in source.files if file.suffix.lower() not in _TEXTS)
+    first = next(images, None)
+    if source.live or first is None or not first.is_file():
+        return Date()
+    return date_of_stamp(first.stat().st_mtime, "file")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

@@ -271,6 +271,17 @@ class RayCloud:
     def __len__(self) -> int:
         return len(self.places)
 
+    def select(self, which: NDArray[np.bool_]) -> RayCloud:
+        """Return the rays of a mask (N,), with the texture of the image if there are any."""
+        return RayCloud(
+            self.places[which],
+            self.sigma_m[which],
+            self.confidence[which],
+            self.count[which],
+            self.unit_m,
+            self.texture if which.any() else np.zeros((0, 0), np.uint8),
+        )
+
     def cloud(self) -> PointCloud:
         return PointCloud(
             self.places * np.float32(self.unit_m),

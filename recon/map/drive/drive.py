@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from recon.core.dates import Date
 from recon.core.errors import FormatError, ReconError, RegistrationError
 from recon.core.machine import versions
 from recon.core.values import Rectified, Trajectory
@@ -38,7 +39,7 @@ from recon.odometry.imu import ImuGuide
 from recon.odometry.protocol import OdometryFrame, OdometryResult
 from recon.places.detector import LastView, NewViews
 from recon.places.keyframe import coarse_of
-from recon.sources.source import StereoSource
+from recon.sources.source import StereoSource, date_of
 from recon.stereo.frame import FrameReconstructor, ReconstructedFrame
 
 _COMMIT_S: Final = 3.0  # time between two commits of a drive whose images arrive just now
@@ -364,9 +365,16 @@ def resuming(where: str | Path) -> Iterator[None]:
 
 
 def session_info(
-    source: StereoSource, config: DriveSettings, start: Mapping[str, Any] | None = None
+    source: StereoSource,
+    config: DriveSettings,
+    start: Mapping[str, Any] | None = None,
+    given: Date | None = None,
 ) -> SessionInfo:
-    """Return what a session is a drive of; ``start`` is what a run is begun with, to resume it."""
+    """Return what a session is a drive of; ``start`` is what a run is begun with, to resume it.
+
+    Its date is the ``given`` one, or what the source says of it.
+    """
+    date = given or date_of(source)
     return SessionInfo(
         source.name,
         source.description,
@@ -374,4 +382,6 @@ def session_info(
         config.model_dump(mode="json"),
         versions(),
         start or {},
+        date.text,
+        date.known_from,
     )

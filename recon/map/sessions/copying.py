@@ -23,13 +23,24 @@ from recon.map.sessions.placed import check_rays
 from recon.map.settings import DriveSettings
 from recon.map.store.map_file import MapFile
 from recon.map.store.records import Key
-from recon.map.store.session import AXES, ENTRY, IMAGES, KEYFRAME, LOOPS, SESSION, SUBMAP, Session
+from recon.map.store.session import (
+    AXES,
+    ENTRY,
+    IMAGES,
+    KEYFRAME,
+    LOOPS,
+    SESSION,
+    SUBMAP,
+    THINNED,
+    Session,
+)
 from recon.map.store.trees import FRAMES, RAYS, RIG
 from recon.odometry.health import segment_numbers
 from recon.places.detector import LoopDetector, StoredKeyframe
 from recon.places.places import path_lengths
 
-_KINDS: Final = (SESSION, AXES, RIG, FRAMES, LOOPS, KEYFRAME, RAYS, SUBMAP, ENTRY)
+KINDS: Final = (SESSION, AXES, RIG, FRAMES, LOOPS, KEYFRAME, RAYS, SUBMAP, ENTRY, THINNED)
+"""Records of a drive, whose keys begin with its number."""
 
 
 def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = ()) -> list[int]:
@@ -52,10 +63,14 @@ def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = (
                 got=f"{session.info.source}, {counted(len(session), 'frame')}",
                 expected="another drive",
             )
-    after = max((session.number for session in target.sessions), default=-1) + 1
-    first = chosen[0].number if chosen and after else 0
+    after, left = target.next_number, source.forgotten
+    known_there = [*(session.number for session in chosen), *(one.number for one in left)]
+    first = min(known_there, default=0) if after else 0
     numbers = {session.number: session.number - first + after for session in chosen}
-    for kind in _KINDS:
+    if left:
+        moved = [replace(one, number=one.number - first + after) for one in left]
+        target.set_forgotten([*target.forgotten, *moved])
+    for kind in KINDS:
         keys: dict[Key, Key] = {}
         for key in source.store.keys(kind):
             number, *rest = key if isinstance(key, tuple) else (key,)

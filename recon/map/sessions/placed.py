@@ -228,8 +228,10 @@ def _observations(map_: MapFile, settings: DriveSettings) -> FrameObservations |
 
 
 def _no_evidence(map_: MapFile, session: Session) -> frozenset[int]:
-    """Return the frames without a place, and those whose images an earlier drive has, too."""
-    return seen_before(map_, session) | _without_place(map_, session)
+    """Return the frames without rays or a place, and those whose images an earlier drive has."""
+    thinned = session.thinned
+    empty = frozenset(() if thinned is None else thinned.empty)
+    return seen_before(map_, session) | _without_place(map_, session) | empty
 
 
 def _without_place(map_: MapFile, session: Session) -> frozenset[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final, overload
 
@@ -19,7 +19,7 @@ from recon.io.files import StrPath, reading, refuse_links
 from recon.look.rig import KnownRig
 from recon.map.store.records import CACHE_BYTES, Store
 from recon.map.store.session import SESSION, Session, SessionInfo
-from recon.map.store.trees import LINKS, Link
+from recon.map.store.trees import FORGOTTEN, LINKS, Forgotten, Link, value_in
 from recon.odometry.health import doubt_about, name_frames, segment_numbers
 from recon.places.detector import KnownPlaces, KnownView
 
@@ -196,8 +196,35 @@ class MapFile:
         content = {"links": [link.to_tree() for link in links], "linked": sorted(linked)}
         self.store.put(LINKS, 0, content, compress=True)
 
+    @property
+    def forgotten(self) -> list[Forgotten]:
+        """The drives that left the map, by number."""
+        if not self.store.has(FORGOTTEN, 0):
+            return []
+        with reading(self.store.name):
+            return [value_in(Forgotten, tree) for tree in self.store.get(FORGOTTEN, 0)["drives"]]
+
+    def set_forgotten(self, forgotten: Collection[Forgotten]) -> None:
+        """Keep which drives left the map."""
+        drives = [asdict(one) for one in sorted(forgotten, key=lambda one: one.number)]
+        self.store.put(FORGOTTEN, 0, {"drives": drives})
+
+    @property
+    def mb_per_km(self) -> float | None:
+        """Size of the file by the length of the paths of all drives; None if nothing moved."""
+        length_m = sum(
+            session.trajectory.path_length_m for session in self.sessions if len(session)
+        )
+        return 1e-3 * self.store.nbytes / length_m if length_m else None
+
+    @property
+    def next_number(self) -> int:
+        """The number of the next drive: none that another one has, or had."""
+        had = [one.number for one in self.forgotten]
+        return max([-1, *had, *(session.number for session in self.sessions)]) + 1
+
     def begin(self, info: SessionInfo) -> Session:
-        number = max((session.number for session in self.sessions), default=-1) + 1
+        number = self.next_number
         self.sessions.append(Session.begin(self.store, number, info))
         return self.sessions[-1]
 

@@ -313,6 +313,23 @@ class Store:
             self._database.execute("COMMIT")
             self._database.execute("BEGIN IMMEDIATE")
 
+    def compact(self) -> None:
+        """Commit, and give the room of deleted records back to the disk."""
+        with self._lock, writing(self.path):
+            self._database.execute("COMMIT")
+            self._database.execute("VACUUM")
+            self._database.execute("BEGIN IMMEDIATE")
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the file, with all that is not committed yet."""
+        with self._lock, reading(self.name):
+            pages, each = (
+                self._database.execute(f"PRAGMA {name}").fetchone()[0]
+                for name in ("page_count", "page_size")
+            )
+            return int(pages * each)
+
     def close(self) -> None:
         """Close the file; what was not committed is lost."""
         with self._lock, suppress(sqlite3.Error):

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from recon.core.dates import Date, DateFrom, date_of_stamp
 from recon.core.errors import FormatError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.text import counted
@@ -52,7 +53,30 @@ OPTIMISED_POSES: Final = "T_world_camera"
 POSES_BEFORE_LINKS: Final = "T_alone_camera"  # the same before links to other drives optimised them
 NO_LOOPS: Final[Mapping[str, Any]] = {"closed": [], "refused": [], OPTIMISED_POSES: None}
 """What a map keeps of a drive without loops, if it keeps anything else with them."""
+THINNED: Final = "thinned"
 _STATE: Final = "state"
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """What is left of a drive of which newer ones saw a part again: rays and keyframes.
+
+    ``empty`` are the frames of which no ray is left.
+    """
+
+    rays: int
+    rays_before: int  # when the drive was mapped
+    keyframes: int
+    keyframes_before: int
+    empty: tuple[int, ...] = ()
+
+    @property
+    def rays_ratio(self) -> float:
+        return self.rays / self.rays_before if self.rays_before else 1.0
+
+    @property
+    def keyframes_ratio(self) -> float:
+        return self.keyframes / self.keyframes_before if self.keyframes_before else 1.0
 
 
 @dataclass(frozen=True)
@@ -61,6 +85,7 @@ class SessionInfo:
 
     ``config`` are the settings of the drive as plain values, ``versions`` those of recon and its
     libraries, ``start`` what the run was started with; in a finished map, where the images are.
+    ``date`` is that of its first image, in UTC ("" = not known), by what ``date_from`` says.
     """
 
     source: str = ""
@@ -69,6 +94,8 @@ class SessionInfo:
     config: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     start: Mapping[str, Any] = field(default_factory=dict)
+    date: str = ""
+    date_from: DateFrom = ""
 
 
 class Session:
@@ -133,6 +160,30 @@ class Session:
         """Size of its scene against a road, to which lengths that were not set are made."""
         with reading(self.where):
             return float(self.info.config.get("scene", {}).get("scale") or 1.0)
+
+    @property
+    def date(self) -> Date:
+        """When the drive began; of a map that does not say so, by its stamps."""
+        if self.info.date or not self._times_s:
+            return Date(self.info.date, self.info.date_from)
+        return date_of_stamp(self._times_s[0])
+
+    @property
+    def thinned(self) -> Thinned | None:
+        """What newer drives left of this one; None = all."""
+        if not self._store.has(THINNED, self.number):
+            return None
+        with reading(self._store.name):
+            return value_in(Thinned, self._store.get(THINNED, self.number))
+
+    @property
+    def with_rays(self) -> list[int]:
+        """The frames of which rays may be left."""
+        empty = () if self.thinned is None else self.thinned.empty
+        return [frame for frame in self._store.numbers(RAYS, self.number) if frame not in empty]
+
+    def set_thinned(self, thinned: Thinned) -> None:
+        self._store.put(THINNED, self.number, asdict(thinned))
 
     @property
     def odometry(self) -> Trajectory:
@@ -361,6 +412,10 @@ class Keyframes:
     def __init__(self, store: Store, session: int = 0) -> None:
         self._store = store
         self._session = session
+
+    def drop(self, frame: int) -> None:
+        self._store.delete(KEYFRAME, (self._session, frame))
+        self._store.cache.drop((KEYFRAME, self._session, frame, "keyframe"))
 
     def put(self, stored: StoredKeyframe) -> None:
         content = {

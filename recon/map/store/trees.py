@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
+from recon.core.dates import DateFrom
 from recon.core.errors import FormatError, ShapeError
 from recon.core.geometry.se3 import check_rigid
 from recon.core.values import (
@@ -297,6 +298,22 @@ def _calibration_in(tree: Mapping[str, Any]) -> Rig:
         return value_in(RectifiedCamera, tree)
     left, right = (value_in(CameraIntrinsics, tree[side]) for side in ("left", "right"))
     return StereoCalibration(left, right, tree["T_right_left"])
+
+
+FORGOTTEN: Final = "forgotten"
+
+
+@dataclass(frozen=True)
+class Forgotten:
+    """A drive that was in a map, and left it."""
+
+    number: int
+    name: str
+    date: str  # when it began, as `recon.core.dates.Date` has it
+    date_from: DateFrom
+    frames: int
+    length_m: float
+    forgotten: str  # when it left
 
 
 LINKS: Final = "links"
