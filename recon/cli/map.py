@@ -35,27 +35,18 @@ def _length(text: str) -> dict[str, Any]:
 
 
 def _check_into(
-    into: Path | None,
-    source: Path | None,
-    *,
-    remove: int | None,
-    keep: list[str] | None,
-    alone: tuple[Path | None, Path | None],
-    pieces: tuple[Any, Any],
+    into: Path | None, source: Path | None, remove: int | None, keep: list[str] | None, *more: Any
 ) -> None:
-    """Refuse options that do not go with --into RUN, or nowhere else."""
+    """Refuse options that do not go with --into RUN (also ``more``, if given), or nowhere else."""
     if into is None and keep:
         raise typer.BadParameter("--keep says what the map of --into RUN keeps")
     if remove is not None and (into is None or source is not None):
         raise typer.BadParameter("--remove takes a session out of --into RUN, and maps no SOURCE")
-    if into is None:
-        return
-    if alone != (None, None):
-        raise typer.BadParameter("--into changes RUN, whole or not at all: no --out, no --resume")
-    if source is None and remove is None and not keep:
+    if into is not None and any(one is not None for one in more):
+        what = "changes RUN in one step: no --out, --resume, --workers, --scheduler, --view"
+        raise typer.BadParameter(f"--into {what}")
+    if into is not None and source is None and remove is None and not keep:
         raise typer.BadParameter("--into RUN takes SOURCE, --remove SESSION or --keep")
-    if pieces != (None, None):
-        raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
 
 
 @opt.takes_groups
@@ -151,12 +142,10 @@ def map_(
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     if out is not None and resume is not None and os.path.realpath(out) != os.path.realpath(resume):
         raise typer.BadParameter("--out and --resume name different folders")
-    _check_into(
-        into, source, remove=remove, keep=keep, alone=(out, resume), pieces=(workers, scheduler)
-    )
+    _check_into(into, source, remove, keep, out, resume, workers, scheduler, view or None)
     if source is None and (date is not None or (resume is None and into is None)):
         raise typer.BadParameter("give SOURCE, or --resume FOLDER, which has its --date")
-    if view and (into or workers or scheduler) is not None:
+    if view and (workers or scheduler) is not None:
         raise typer.BadParameter("--view follows one map that grows: no --into, --workers")
     with shared.one_line_errors():
         from recon.cli.progress import warn

@@ -202,7 +202,7 @@ class JoinedSummary(RunSummary):
     positions_misfit_rms_m: float | None  # None = no position was measured
     forgotten: Sequence[Forgotten]  # drives that left the map, since it was made
     map_mb_per_km: float | None  # size of map.recon, by the paths of the drives in it
-    tended: str | None = hidden(None)  # what was forgotten now; None = nothing was to be
+    tended: str = hidden("")  # what was forgotten now
     made: UsualProducts = inline()
     T_map_world: Float64  # (4, 4)
 

@@ -37,7 +37,7 @@ from recon.map.sessions.joining import doubts_of_lengths, join_new
 from recon.map.sessions.keep import DRIVES, Keep
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
 from recon.map.sessions.placed import place_map, settings_of
-from recon.map.sessions.tending import Tended, forgotten_of, tend
+from recon.map.sessions.tending import forgotten_of, tend
 from recon.map.store.map_file import MAP_FILE
 from recon.map.store.session import Session
 from recon.report.map_page import write_joined_page
@@ -172,12 +172,11 @@ def _make_joined(
         left_out = [] if survey is None else hold(map_, survey)
         with run.stage("links"):
             join_new(map_, new)
-        tended = None
-        if options.keep not in (None, Keep()):
-            with run.stage("forget"):
-                tended = tend(map_, settings, options.keep)
+        with run.stage("forget"):
+            tended = "" if options.keep is None else tend(map_, settings, options.keep)
         map_.commit()
-        map_.store.compact()
+        if tended:
+            map_.store.compact()
         with run.stage("map"):
             placed = place_map(map_, settings, run.threads)
         context = ExportContext(map_, placed, settings.mesh, threads=run.threads)
@@ -195,7 +194,7 @@ def _make_joined(
         return run.finish(summary, source=names, inputs=inputs, record=record)
 
 
-def _figures(map_: Map, made: UsualProducts, tended: Tended | None) -> JoinedSummary:
+def _figures(map_: Map, made: UsualProducts, tended: str) -> JoinedSummary:
     placed = map_.placed
     kept = [link for link in map_.links if link.kept]
     pairs = Counter("-".join(map(str, link.sessions)) for link in kept)
@@ -222,7 +221,7 @@ def _figures(map_: Map, made: UsualProducts, tended: Tended | None) -> JoinedSum
         ],
         forgotten=map_.forgotten,
         map_mb_per_km=map_.mb_per_km,
-        tended=None if tended is None else tended.text,
+        tended=tended,
         links=LinkFigures(len(kept), len(map_.links) - len(kept), pairs),
         positions_misfit_rms_m=misfit_rms_m(map_),
         made=made,

@@ -9,6 +9,7 @@
 - `deprecated.py`: names that are replaced;
 - `plugins.py`: parts that others write, registered by packages or given as objects;
 - `text.py`: numbers read from text and written with words and units;
+- `dates.py`: when a drive began, and by what that is known;
 - `summary.py`: what a command found, as a value, and how it becomes JSON;
 - `progress.py`: who is told how far work is; `work.py`: threads, and seconds per stage;
   `machine.py`: cores, memory and its limit, versions;

@@ -100,10 +100,26 @@ def test_wrong_poses_priors_and_settings_are_refused(good_drive, tmp_path, optio
 
 
 @pytest.mark.parametrize(
+    ("words", "word"),
+    [
+        (["--into", "run", "--keep", "0"], "--keep: not what a map may keep"),
+        (["--into", "run", "--keep=5,0,1,9"], "got 5,0,1,9"),
+        (["--into", "run", "--keep", "2", "--keep", "3"], "each once"),
+        (["--date", "yesterday"], "--date: not the date of a drive"),
+        (["--date", "1950-01-01"], "from 1990"),
+    ],
+)
+def test_what_a_map_cannot_keep_and_what_is_no_date_are_refused(good_drive, tmp_path, words, word):
+    assert_one_line(run("map", good_drive, *words, "--quiet"), word)
+    assert not (tmp_path / "outputs").exists()
+
+
+@pytest.mark.parametrize(
     "line",
     [
         "map", "map x --no-such-option", "map x --poses p --prior q", "map --remove 1",
         "map x --into run --remove 1", "map x --into run --out o", "map --into run --resume run",
+        "map x --keep 2", "map --into run", "map --resume run --date 2024-11-30",
         "map x --into run --workers 2", "map --resume a --out b", "map x --workers 2 --scheduler s",
         "evaluate middlebury x --json --latex", "board",
         "board chess:9x6 --board chess:9x6", "batch", "batch map x --resume y", "piece plan 0",

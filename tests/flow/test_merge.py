@@ -126,6 +126,11 @@ def test_a_drive_that_is_added_begins_with_the_rig_of_the_last_one(run):
     turned = keep_turned_rig(run)
     added = run_map_into(run, part(FIRST), None, OPTIONS).to_json()
     assert [drive["rig"]["refined"] for drive in added["sessions"]] == [True, True]
+    assert [drive["rays_kept"] for drive in added["sessions"]] == [1.0, 1.0]  # of two, both
+    assert [drive["date"] for drive in added["sessions"]] == ["", ""]  # stamps begin at 0
+    length_m = sum(drive["length_m"] for drive in added["sessions"])
+    size = (run / "map/map.recon").stat().st_size
+    assert added["map_mb_per_km"] == pytest.approx(1e-3 * size / length_m, rel=0.02)
     assert (run / "rig.yaml").is_file()
     with Map.open(run) as map_:
         found = map_.session(1).rig.calibration
@@ -138,7 +143,9 @@ def test_a_drive_is_taken_out_of_a_map_of_chosen_frames(merged, tmp_path):
     (run / "config.yaml").write_text(yaml.safe_dump(chosen))
     done = refusals.run("map", "--into", run, "--remove", "2", "--no-mesh")
     assert done.code == 0, done.err
-    assert [drive["number"] for drive in summary_of(run)["sessions"]] == [0, 1]
+    found = summary_of(run)
+    assert [drive["number"] for drive in found["sessions"]] == [0, 1]
+    assert [(drive["number"], drive["name"]) for drive in found["forgotten"]] == [(2, "film")]
 
 
 @pytest.mark.parametrize("at", ["recon.run.directory.exchange", "recon.commands.merge.place_map"])

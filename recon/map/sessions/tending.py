@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Any, Final
 
@@ -26,9 +26,11 @@ from recon.core.dates import DAY_S
 from recon.core.geometry.se3 import adjoint, apply, invert
 from recon.core.kernels.voxels import are_among, find_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
+from recon.core.text import counted
 from recon.core.values import RayCloud
 from recon.core.values.arrays import Bool, Float64, Int64
 from recon.core.values.camera import project
+from recon.io.files import reading
 from recon.map.builders import FREE_MARGIN_SIGMAS
 from recon.map.kernels.raycast import BLOCK_EDGE
 from recon.map.sessions.copying import KINDS
@@ -48,30 +50,16 @@ _STEPS: Final = 2  # samples of a ray in the length of a coarse edge
 _MOST_ROWS: Final = 1 << 20  # cells of single frames that are held before they are joined
 
 
-@dataclass(frozen=True)
-class Tended:
-    """What was forgotten: drives of those before, and rays."""
-
-    drives: int
-    forgotten: int
-    rays: int
-    rays_left: int
-
-    @property
-    def text(self) -> str:
-        """What was forgotten, for people; "" = nothing."""
-        lost = self.rays - self.rays_left
-        parts = [f"{self.forgotten} of {self.drives} drives"] if self.forgotten else []
-        parts += [f"{100 * lost / self.rays:.0f} % of the rays"] if lost else []
-        return ", ".join(parts)
-
-
-def tend(map_: MapFile, settings: DriveSettings, keep: Keep) -> Tended:
+def tend(map_: MapFile, settings: DriveSettings, keep: Keep) -> str:
     """Forget what newer drives saw again, what lies outside a region, and drives that are old.
 
     Drives must be placed; no pose moves. The first drive stays with its poses at least, as the axes
-    of the map are its; those that share no place with it stay unless they are old.
+    of the map are its; those that share no place with it stay unless they are old. Returns what was
+    forgotten, in a line for people, "" = nothing.
     """
+    newest = keep.drives is None or len(map_.linked) <= keep.drives
+    if newest and keep.days is None and keep.region is None:
+        return ""
     before, old, views = len(map_.sessions), _too_old(map_, keep), _views_to_drop(map_, keep)
     looks = [_Seen(map_, each, settings) for each in tracked(map_.linked, "drives", "look again")]
     rays, left, leaving = 0, 0, old - {map_.first.number}
@@ -85,7 +73,9 @@ def tend(map_: MapFile, settings: DriveSettings, keep: Keep) -> Tended:
         if not (thinned.rays or thinned.keyframes or voxels or session is map_.first):
             leaving.add(number)
     forget(map_, leaving)
-    return Tended(before, len(leaving), rays, left)
+    parts = [f"{len(leaving)} of {counted(before, 'drive')}"] if leaving else []
+    parts += [f"{100 * (1 - left / rays):.0f} % of the rays"] if left < rays else []
+    return ", ".join(parts)
 
 
 def forget(map_: MapFile, numbers: Collection[int]) -> None:
@@ -143,9 +133,10 @@ def _anchored(map_: MapFile, numbers: Collection[int]) -> list[Link]:
 
 def _too_old(map_: MapFile, keep: Keep) -> set[int]:
     """Return the numbers of drives that are older than the newest by more than may be."""
-    dates = {one.number: one.date.seconds for one in map_.sessions if one.date.text}
     if keep.days is None:
         return set()
+    with reading(map_.store.name):
+        dates = {one.number: one.date.seconds for one in map_.sessions if one.date.text}
     newest_s = max(dates.values(), default=0.0)
     return {number for number, date_s in dates.items() if newest_s - date_s > keep.days * DAY_S}
 

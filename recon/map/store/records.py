@@ -323,12 +323,9 @@ class Store:
     @property
     def nbytes(self) -> int:
         """Bytes of the file, with all that is not committed yet."""
+        query = "SELECT page_count * page_size FROM pragma_page_count(), pragma_page_size()"
         with self._lock, reading(self.name):
-            pages, each = (
-                self._database.execute(f"PRAGMA {name}").fetchone()[0]
-                for name in ("page_count", "page_size")
-            )
-            return int(pages * each)
+            return int(self._database.execute(query).fetchone()[0])
 
     def close(self) -> None:
         """Close the file; what was not committed is lost."""

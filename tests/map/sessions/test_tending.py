@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from recon.core.dates import Date, date_of_stamp, given_date
-from recon.core.errors import SettingsError
+from recon.core.errors import FormatError, SettingsError
 from recon.core.geometry.se3 import apply
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
@@ -82,9 +82,8 @@ def test_what_newer_drives_confirm_goes_and_what_only_the_first_saw_stays():
     assert np.mean(rays_z(map_, 0) < 12.0) > 0.8
     for number in (2, 3):  # the newest two are whole
         assert after[number] == before[number][1:]
-    assert tended.rays - tended.rays_left == sum(row[1] for row in before) - sum(
-        rays for rays, _ in after.values()
-    )
+    had, left = sum(row[1] for row in before), sum(rays for rays, _ in after.values())
+    assert tended == f"1 of 4 drives, {100 * (1 - left / had):.0f} % of the rays"
     for number, path in world_poses(map_).items():
         np.testing.assert_array_equal(path, paths[number])
 
@@ -107,11 +106,9 @@ def test_a_drive_of_which_nothing_is_left_leaves_and_its_number_is_not_used_agai
 
 def test_the_first_drive_stays_with_its_poses():
     map_ = street((0.0, 0.0, 0.0, 0.0))
-    tended = tend(map_, CONFIG, TWO)
+    assert tend(map_, CONFIG, TWO).startswith("1 of 4 drives, ")
     assert [one.number for one in map_.sessions] == [0, 2, 3]
     assert (len(map_.first), len(rays_z(map_, 0)), len(voxels_z(map_, 0))) == (FRAMES, 0, 0)
-    assert tended.forgotten == 1
-    assert "1 of 4 drives" in tended.text
     assert len(cloud_of(place_map(map_, CONFIG).tiles))
 
 
@@ -119,7 +116,7 @@ def test_tending_twice_is_tending_once():
     map_ = street((0.0, 6.0, 12.0, 14.0, 15.0))
     tend(map_, CONFIG, TWO)
     once = state(map_)
-    assert tend(map_, CONFIG, TWO).text == ""
+    assert tend(map_, CONFIG, TWO) == ""
     assert state(map_) == once
 
 
@@ -150,7 +147,7 @@ def test_a_map_of_few_drives_is_untouched():
     for starts_m in ((0.0,), (0.0, 0.0)):
         map_ = street(starts_m)
         before = state(map_)
-        assert tend(map_, CONFIG, TWO).text == ""
+        assert tend(map_, CONFIG, TWO) == ""
         assert state(map_) == before
         assert all(one.thinned is None or one.thinned.rays_ratio == 1.0 for one in map_.sessions)
 
@@ -174,12 +171,11 @@ def test_old_drives_leave_and_the_first_keeps_its_poses_alone():
     for number, day in enumerate(("2026-01-01", "2026-03-01", "", "2026-06-01")):
         dated(map_.session(number), day)
     whole = len(rays_z(map_, 3))
-    tended = tend(map_, CONFIG, Keep(days=90.0))
+    assert "1 of 4 drives" in tend(map_, CONFIG, Keep(days=90.0))
     assert [one.number for one in map_.sessions] == [0, 2, 3]  # without a date, 2 stays
     assert map_.forgotten[0].date == "2026-03-01"
     assert (len(rays_z(map_, 0)), len(map_.first)) == (0, FRAMES)
     assert len(rays_z(map_, 3)) == whole
-    assert tended.forgotten == 1
 
 
 def test_drives_that_only_one_that_leaves_held_stay_where_they_are():
@@ -242,3 +238,10 @@ def test_a_session_without_a_date_has_that_of_its_stamps():
         assert session.date == Date("2025-01-06T08:00:00Z", "stamps")
         dated(session, "2024-01-01")
         assert session.date == Date("2024-01-01", "given")
+
+
+def test_a_damaged_date_is_an_error_of_the_map():
+    map_ = street((0.0, 12.0))
+    dated(map_.session(1), "some day")
+    with pytest.raises(FormatError, match="temporary map"):
+        tend(map_, CONFIG, Keep(days=90.0))
