@@ -3,6 +3,7 @@
 from recon.commands.cameras import run_audit as run_audit
 from recon.commands.config import ReconConfig as ReconConfig
 from recon.commands.config import load_config as load_config
+from recon.commands.diff import run_diff as run_diff
 from recon.commands.evaluate_middlebury import run_middlebury as run_middlebury
 from recon.commands.export import export_map as export_map
 from recon.commands.export import run_export as run_export

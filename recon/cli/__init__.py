@@ -23,7 +23,7 @@ from recon.cli.errors import interrupt_on_signals, report_unforeseen
 from recon.cli.evaluate import app as evaluate
 from recon.cli.evaluate import paper
 from recon.cli.getting_started import datasets, demo, doctor, settings
-from recon.cli.map import live, localize, map_, merge, piece
+from recon.cli.map import diff, live, localize, map_, merge, piece
 from recon.cli.options import Commands, option
 from recon.cli.pair import disparity, pair
 from recon.cli.products import export, mesh, occupancy
@@ -39,7 +39,7 @@ app = Commands(
 _PANELS: Final = {
     "Getting started": (demo, doctor, settings),
     "Reconstruction and mapping": (
-        pair, disparity, map_, localize, live, merge, view, export, mesh, occupancy, batch,
+        pair, disparity, map_, localize, live, merge, diff, view, export, mesh, occupancy, batch,
     ),
     "Cameras and recordings": (board, calibrate, rectify, capture, audit, datasets),
     "Evaluation": (evaluate, paper),

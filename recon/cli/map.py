@@ -265,6 +265,31 @@ def merge(
 
 
 @opt.takes_groups
+def diff(
+    before: Annotated[Path, typer.Argument(help="Folder of a finished run, or its map file.")],
+    after: Annotated[Path, typer.Argument(help="That of a later run through the same place.")],
+    out: opt.Out = None,
+    *,
+    shared: opt.Shared,
+) -> None:
+    """Find what came and what went between two runs through one place.
+
+    Each may hold several drives. They are linked by places that both saw. Points
+    of either day are the same, came, went, or could not be compared, since the
+    other day did not look there. Things are listed with place, size, volume, when
+    they were seen, and a picture of both days.
+
+    Examples:
+      recon diff outputs/monday outputs/friday --out outputs/changes
+    """
+    with shared.one_line_errors():
+        from recon.commands.diff import run_diff
+
+        summary = run_diff(before, after, shared.options("diff", out))
+    shared.show(summary)
+
+
+@opt.takes_groups
 def live(
     source: Annotated[
         str,

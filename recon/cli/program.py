@@ -19,9 +19,9 @@ from recon.run.batch.job import Job
 from recon.run.batch.job_file import Entry, JobList, check_names, name_of_swept
 
 COMMANDS: Final = (
-    "map", "localize", "merge", "pair", "disparity", "export", "mesh", "occupancy", "rectify",
-    "audit", "demo", "paper", "evaluate trajectory", "evaluate map", "evaluate occupancy",
-    "evaluate disparity", "evaluate middlebury",
+    "map", "localize", "merge", "diff", "pair", "disparity", "export", "mesh", "occupancy",
+    "rectify", "audit", "demo", "paper", "evaluate trajectory", "evaluate map",
+    "evaluate occupancy", "evaluate disparity", "evaluate middlebury",
 )  # fmt: skip
 """What a job can be."""
 _WITHOUT_SOURCE: Final = ("demo",)

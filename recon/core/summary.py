@@ -49,7 +49,7 @@ def inline_each() -> Any:
     return field(default_factory=dict, metadata={_FORM: _INLINE_EACH})
 
 
-def hidden(default: Any) -> Any:
+def hidden(default: Any = MISSING) -> Any:
     """Return a field for the terminal alone, which is not in the JSON."""
     return field(default=default, metadata={_FORM: _HIDDEN})
 

@@ -21,6 +21,7 @@ from recon.io.files import reading, resolved
 from recon.map.map import Map
 from recon.map.sessions.georeference import Georeference
 from recon.map.sessions.placed import PlacedMap, settings_of
+from recon.map.store.map_file import MapFile
 from recon.map.store.session import IMAGES, Session
 from recon.sources.registry import open_source
 from recon.sources.settings import SourceSettings
@@ -176,18 +177,21 @@ def open_images(map_: Map, moved: Sequence[Path] = ()) -> list[DriveImages]:
     ``moved`` is where drives are now that are not where they were, by the names of their folders if
     there are several.
     """
-    opened, placed, alone = [], map_.placed, len(map_.linked) == 1
-    for session in map_.linked:
-        named = [path for path in moved if alone or resolved(path).name == session.info.source]
-        try:
-            source = _opened(session, named[0] if named else None)
-            rig = _rig(session, source)
-        except ReconError as error:
-            hint = "name the drive, as it was mapped, with --images"
-            raise error.copy_with(hint=error.hint or hint) from error
-        prefix = "" if alone else f"{session.number}_"
-        opened.append(DriveImages(session, placed[session.number], prefix, source, rig))
-    return opened
+    return [open_drive(map_, session, moved) for session in map_.linked]
+
+
+def open_drive(map_: MapFile, session: Session, moved: Sequence[Path] = ()) -> DriveImages:
+    """Open one of the linked drives of a map again, as `open_images` does."""
+    alone = len(map_.linked) == 1
+    named = [path for path in moved if alone or resolved(path).name == session.info.source]
+    try:
+        source = _opened(session, named[0] if named else None)
+        rig = _rig(session, source)
+    except ReconError as error:
+        hint = "name the drive, as it was mapped, with --images"
+        raise error.copy_with(hint=error.hint or hint) from error
+    prefix = "" if alone else f"{session.number}_"
+    return DriveImages(session, map_.placed[session.number], prefix, source, rig)
 
 
 def _opened(session: Session, moved: Path | None) -> StereoSource:

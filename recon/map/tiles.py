@@ -211,6 +211,11 @@ class Tiles:
         xyz = np.concatenate(found)
         return xyz[rectangle.contains(xyz)]
 
+    def evidence(self, key: TileKey, drive: int) -> CellEvidence:
+        """Return what one of the drives saw in a tile and its margin."""
+        self.wide_voxels(key)
+        return self._chain.evidence(key, drive)
+
     def make_voxels(self, key: TileKey) -> None:
         """Make the voxels of a tile, and find the floors among them, unless that is done."""
         if not self._parts.numbers(_FLOORS, key):

@@ -51,8 +51,8 @@ def test_a_command_line_has_what_the_job_says_and_limits_are_needs_of_a_worker()
 
 
 SOURCES = {
-    "merge": 2, "pair": 2, "disparity": 2, "rectify": 2, "demo": 0, "evaluate trajectory": 2,
-    "evaluate map": 2, "evaluate disparity": 2,
+    "merge": 2, "diff": 2, "pair": 2, "disparity": 2, "rectify": 2, "demo": 0,
+    "evaluate trajectory": 2, "evaluate map": 2, "evaluate disparity": 2,
 }  # fmt: skip
 
 INPUTS = {

@@ -10,6 +10,7 @@ import pytest
 
 from recon.cli.tables import print_summary
 from recon.commands.batch import BatchSummary
+from recon.commands.diff import DiffSummary
 from recon.commands.map_summary import (
     CloudSummary,
     ExportSummary,
@@ -208,6 +209,10 @@ SUMMARIES: dict[str, Summary] = {
     ),
     "live": replace(MAP, read=LIVE),
     "merge": JOINED,
+    "diff": DiffSummary(
+        before="outputs/monday", after="outputs/friday", counts={"came": 123, "went": 1},
+        not_compared_ratio={"before": 0.1, "after": 0.2}, things=(), T_map_world=np.eye(4), **COST,
+    ),
     "localize": LOCALIZED,
     "localize in another place": replace(
         LOCALIZED, drive=replace(FOUND, first_fix_frame=None, median_sigma_m=None)

@@ -49,14 +49,9 @@ def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = (
     They keep their numbers where the other map is empty, else they get the next ones.
     """
     chosen = [session for session in source.sessions if session.number not in without]
-    known = [other.odometry for other in target.sessions]
+    known = same_drives(target, source)
     for session in chosen:  # one that a map has already would be evidence of its own
-        path = session.odometry
-        if any(
-            np.array_equal(other.T_world_camera, path.T_world_camera)
-            and np.array_equal(other.timestamps_s, path.timestamps_s)
-            for other in known
-        ):
+        if session.number in known:
             raise FormatError(
                 "the map has this drive already",
                 where=session.where,
@@ -87,6 +82,20 @@ def copy_sessions(source: MapFile, target: MapFile, without: Collection[int] = (
     target.set_links([*target.links, *links], kept or linked)
     target.sessions += [Session(target.store, number) for number in numbers.values()]
     return list(numbers.values())
+
+
+def same_drives(one: MapFile, other: MapFile) -> list[int]:
+    """Return the numbers of the drives of another map that one has, too, by their paths."""
+    paths = [session.odometry for session in one.sessions]
+    return [
+        session.number
+        for session in other.sessions
+        if any(
+            np.array_equal(path.T_world_camera, session.odometry.T_world_camera)
+            and np.array_equal(path.timestamps_s, session.odometry.timestamps_s)
+            for path in paths
+        )
+    ]
 
 
 def join_parts(

@@ -76,10 +76,7 @@ def place_map(
     placed = PlacedSubmaps(map_, settings)
     submaps: Iterable[Submap] = placed if only is None else placed.only(only)
     if not placed.ready and only is None:
-        # They may be cut several times, and are slow to make: once, into a temporary store.
-        submaps = made = Submaps(Store.temporary(cache_bytes=settings.memory.cache_bytes))
-        for submap in side_by_side(placed.__getitem__, range(len(placed)), threads=threads):
-            made.add(replace(submap, index=len(made), first_frame=made.frames))
+        submaps = placed.made(threads)
     tiles = Tiles.of_submaps(
         submaps,
         settings,
@@ -157,6 +154,13 @@ class PlacedSubmaps:
     def __iter__(self) -> Iterator[Submap]:
         return map(self.__getitem__, range(len(self)))
 
+    def made(self, threads: int) -> Submaps:
+        """Make all, once, into a temporary store: they may be cut several times, and are slow."""
+        made = Submaps(Store.temporary(cache_bytes=self._settings.memory.cache_bytes))
+        for submap in side_by_side(self.__getitem__, range(len(self)), threads=threads):
+            made.add(replace(submap, index=len(made), first_frame=made.frames))
+        return made
+
     def only(self, numbers: Collection[int]) -> Iterator[Submap]:
         """Yield all submaps of an only drive, but those of other numbers empty, and not read."""
         nothing = join_fused(()), join_occupancy(())
@@ -206,11 +210,16 @@ def _beside(
     return CastSubmaps(session, settings, map_.first.T_map_world, poses, without), moves
 
 
-def _observations(map_: MapFile, settings: DriveSettings) -> FrameObservations | None:
-    """Return what frames of the linked drives saw, by their rays; None where a drive kept none."""
+def observations_of(
+    map_: MapFile, settings: DriveSettings, sessions: Sequence[Session] | None = None
+) -> FrameObservations | None:
+    """Return what frames saw, by their rays; None where a drive kept none.
+
+    Those of some linked drives, in that order; None = of all.
+    """
     seen: list[tuple[Session, int]] = []
     poses = []
-    for session in map_.linked:
+    for session in map_.linked if sessions is None else sessions:
         if session.ray_frames != len(session):
             return None
         T_map_camera, without = session.trajectory.T_world_camera, _no_evidence(map_, session)
@@ -242,7 +251,7 @@ def _without_place(map_: MapFile, session: Session) -> frozenset[int]:
 
 def _with_path(map_: MapFile, settings: DriveSettings, tiles: Tiles) -> PlacedMap:
     """Return the tiles of a map with what its frames saw, and the paths of its linked drives."""
-    tiles.observations = _observations(map_, settings)
+    tiles.observations = observations_of(map_, settings)
     paths, good, placed = list[Float64](), list[Bool](), map_.placed
     for session in map_.linked:
         if paths:  # a row between two drives
@@ -293,7 +302,7 @@ def _make_tiles(
     keys, file = task
     tiles = taken(path=file)
     with closing(MapFile.open(map_file)) as map_:
-        tiles.observations = _observations(map_, settings)
+        tiles.observations = observations_of(map_, settings)
         for key in keys:
             tiles.make_voxels(key)
             tiles.cloud(key)

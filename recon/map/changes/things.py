@@ -1,0 +1,172 @@
+"""What came or went in pieces: where, how large, how much, and which frames saw it.
+
+Error alone changes cells anywhere, so those that changed alone say how frequent that is: with a
+frequency ``p``, chance makes ``n·(c·p)^(k-1)`` pieces of ``k`` cells from ``n`` such cells, if a
+cell can be joined in ``c`` ways (a bound of the number of lattice animals). Pieces are things from
+the size of which less than one in ten maps has one by chance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
+
+from recon.core.kernels.voxels import pack_keys
+from recon.core.summary import Figures, hidden
+from recon.core.values import PointCloud
+from recon.core.values.arrays import Float64, Int64, UInt8
+from recon.map.occupancy.bodies import FrameObservations, pieces_of
+from recon.map.store.session import Session
+
+CLASSES: Final = ("same", "came", "went", "not compared")
+SAME, CAME, WENT, NOT_COMPARED = range(4)
+_GAP_CELLS: Final = 2.5  # between cells of a piece; those of a body have gaps of two
+_WAYS: Final = math.e * 24  # to join a cell: a surface has 24 others within such a gap
+_BY_CHANCE: Final = 0.1  # pieces in a map
+_FIRST_DATE_S: Final = 1e8  # stamps from here on, in 1973, are dates
+
+
+@dataclass(frozen=True, eq=False)
+class Day:
+    """Drives, what they saw, and their cloud, map axes, with the class of each point (N,)."""
+
+    sessions: Sequence[Session]
+    observations: FrameObservations
+    cloud: PointCloud
+    classes: UInt8
+
+    @property
+    def not_compared_ratio(self) -> float:
+        """Fraction of the points, which are as dense as voxels, that could not be compared."""
+        return float(np.mean(self.classes == NOT_COMPARED)) if len(self.cloud) else 0.0
+
+
+@dataclass(frozen=True)
+class Sighting(Figures):
+    """A frame that saw a thing; ``date_utc`` None = its stamp is no date."""
+
+    session: int
+    drive: str
+    frame: int
+    time_s: float
+    date_utc: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class Thing(Figures):
+    """Something that came or went; its box is in map axes, turned from x to y by its heading."""
+
+    number: int
+    change: str  # came or went
+    centre_m: Float64  # (3,)
+    length_m: float
+    width_m: float
+    height_m: float
+    heading_deg: float
+    volume_m3: float | None  # of what was seen, over the other day's ground; None = not seen then
+    volume_sigma_m3: float | None
+    points: int
+    first_seen: Sighting
+    last_seen: Sighting
+    corners_m: Float64 = hidden()  # (8, 3), those of its box, the lower four first
+    xyz: Float64 = hidden()  # (N, 3), its points
+    hits: Int64 = hidden()  # (F,), cells of it that each frame of its day hit
+    picture: str | None = None  # None = no image of either day could be read
+
+
+def things_of(own: Day, other: Day, kind: int) -> list[Thing]:
+    """Return the things of a day among its points of the class ``CAME`` or ``WENT``."""
+    seen, cloud = own.observations, own.cloud.select(own.classes == kind)
+    cell_m = seen.settings.resolution_m
+    keys, home = np.unique(_cells(cloud.xyz, cell_m), return_inverse=True)
+    if not len(keys):
+        return []
+    middles = np.stack([np.bincount(home, axis) for axis in cloud.xyz.T], axis=1)
+    tree = cKDTree(middles / (np.bincount(home)[:, None] * cell_m))
+    pairs = tree.query_pairs(_GAP_CELLS, output_type="ndarray").astype(np.int64)
+    piece = pieces_of(len(keys), pairs)
+    sizes = np.bincount(piece)
+    compared = len(np.unique(_cells(own.cloud.xyz[own.classes != NOT_COMPARED], cell_m)))
+    enough = sizes >= least_cells(int((sizes == 1).sum()), compared)
+    hits = np.zeros((len(seen.frames), len(sizes)), np.int64)
+    for frame, look in seen.by_frame(keys):
+        hits[frame] = np.bincount(piece[look > 0], minlength=len(sizes))
+    return [
+        _thing(own, other, cloud.select(piece[home] == one), hits[:, one], kind)
+        for one in np.flatnonzero(enough & hits.any(axis=0)).tolist()
+    ]
+
+
+def least_cells(alone: int, compared: int) -> int:
+    """Return how many cells a piece has that is no chance, where so many changed all alone."""
+    joined = _WAYS * max(alone, 1) / max(compared, 1)
+    if joined >= 1:
+        return compared + 1
+    return 1 + max(1, math.ceil(math.log(_BY_CHANCE / max(alone, 1)) / math.log(joined)))
+
+
+def _thing(own: Day, other: Day, cloud: PointCloud, hits: Int64, kind: int) -> Thing:
+    """Return a thing by its points."""
+    xyz, seen = cloud.xyz.astype(np.float64), np.flatnonzero(hits).tolist()
+    rectangle = cv2.minAreaRect(np.ascontiguousarray(cloud.xyz[:, :2]))
+    (x, y), (length, width), turn = rectangle
+    if width > length:
+        length, width, turn = width, length, turn + 90.0
+    low, high = float(xyz[:, 2].min()), float(xyz[:, 2].max())
+    plan = np.tile(cv2.boxPoints(rectangle), (2, 1))
+    return Thing(
+        0, CLASSES[kind], np.array([x, y, (low + high) / 2]), length, width, high - low,
+        (turn + 90.0) % 180.0 - 90.0, *_volume(cloud, other.cloud, own.observations),
+        len(cloud), _sighting(own, seen[0]), _sighting(own, seen[-1]),
+        np.column_stack([plan, np.repeat([low, high], 4)]), xyz, hits,
+    )  # fmt: skip
+
+
+def _sighting(day: Day, row: int) -> Sighting:
+    number, frame = day.observations.frames[row]
+    session = next(one for one in day.sessions if one.number == number)
+    time_s, date = float(session.trajectory.timestamps_s[frame]), None
+    if time_s >= _FIRST_DATE_S:
+        date = datetime.fromtimestamp(time_s, timezone.utc).isoformat(timespec="seconds")
+    return Sighting(number, session.info.source, frame, time_s, date)
+
+
+def _volume(
+    cloud: PointCloud, other: PointCloud, seen: FrameObservations
+) -> tuple[float | None, float | None]:
+    """Return the volume between points and the lowest ones of another day, and its sigma, m³.
+
+    Summed are columns that both days saw. Those at the border are covered by half, give or take
+    1/√12; the errors of heights are those of the points.
+    """
+    cell_m = seen.settings.resolution_m
+    low = np.floor(cloud.xyz[:, :2].min(axis=0) / cell_m)
+    shape = tuple((np.floor(cloud.xyz[:, :2].max(axis=0) / cell_m) - low + 1).astype(int))
+    top, ground = np.full(shape, -np.inf), np.full(shape, np.inf)
+    for heights, add, of in ((top, np.maximum, cloud), (ground, np.minimum, other)):
+        columns = (np.floor(of.xyz[:, :2] / cell_m) - low).astype(int)
+        inside = ((columns >= 0) & (columns < shape)).all(axis=1)
+        add.at(heights, (*columns[inside].T,), of.xyz[inside, 2])
+    both = np.isfinite(top) & np.isfinite(ground)
+    if not both.any():
+        return None, None
+    height_m = (top[both] - ground[both]).clip(0.0)
+    whole = binary_erosion(np.pad(np.isfinite(top), 1))[1:-1, 1:-1][both]
+    covered = np.where(whole, 1.0, 0.5)
+    sigmas = [np.zeros(1) if of.sigma_m is None else of.sigma_m for of in (cloud, other)]
+    error_m = math.hypot(*(float(np.median(one)) for one in sigmas))
+    variance = (covered * error_m) ** 2 + np.where(whole, 0.0, height_m**2 / 12)
+    return float(height_m @ covered) * cell_m**2, float(np.sqrt(variance.sum())) * cell_m**2
+
+
+def _cells(xyz: NDArray[np.floating[Any]], cell_m: float) -> Int64:
+    return pack_keys(np.floor(xyz / cell_m).astype(np.int64))
