@@ -80,6 +80,12 @@ def map_(
         int | None,
         opt.option("With --into, without SOURCE: take a drive out of its map.", metavar="SESSION"),
     ] = None,
+    check: Annotated[
+        Path | None,
+        opt.option(
+            "Read every record of a map and say what is in it; without SOURCE.", metavar="RUN|FILE"
+        ),
+    ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
     view: View = False,
@@ -104,21 +110,33 @@ def map_(
       recon map rides/long --workers 4
       recon map rides/tomorrow --into outputs/map/latest
       recon map --into outputs/map/latest --remove 1
+      recon map --check outputs/map/latest
     """
-    if poses is not None and prior is not None:
-        raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
-    if out is not None and resume is not None and os.path.realpath(out) != os.path.realpath(resume):
-        raise typer.BadParameter("--out and --resume name different folders")
-    if into is not None and (resume is not None or out is not None):
-        raise typer.BadParameter("--into changes RUN, whole or not at all: no --out, no --resume")
-    if remove is not None and (into is None or source is not None):
-        raise typer.BadParameter("--remove takes a session out of --into RUN, and maps no SOURCE")
-    if source is None and resume is None and remove is None:
-        raise typer.BadParameter("give SOURCE, or --resume FOLDER")
-    if into is not None and (workers or scheduler) is not None:
-        raise typer.BadParameter("--into maps the drive in one piece: no --workers, no --scheduler")
-    if view and (into or workers or scheduler) is not None:
-        raise typer.BadParameter("--view follows one map that grows: no --into, --workers")
+    shared_out = workers is not None or scheduler is not None
+    nothing = source is None and resume is None and remove is None
+    other_out = resume is not None and os.path.realpath(out or resume) != os.path.realpath(resume)
+    more = (source or out or resume or into or remove) is not None or bool(shared.changes)
+    for wrong, what in (
+        (check and more, "--check reads a map, and maps nothing: give it alone"),
+        (poses and prior, "--poses leaves nothing for --prior to do; give one of them"),
+        (other_out, "--out and --resume name different folders"),
+        (
+            into is not None and (resume or out) is not None,
+            "--into changes RUN, whole or not at all: no --out, no --resume",
+        ),
+        (
+            remove is not None and (into is None or source is not None),
+            "--remove takes a session out of --into RUN, and maps no SOURCE",
+        ),
+        (nothing and not check, "give SOURCE, or --resume FOLDER"),
+        (into and shared_out, "--into maps the drive in one piece: no --workers, no --scheduler"),
+        (view and (into or shared_out), "--view follows one map that grows: no --into, --workers"),
+    ):
+        if wrong:
+            raise typer.BadParameter(what)
+    if check is not None:
+        _check(check, shared)
+        return
     with shared.one_line_errors():
         from recon.cli.progress import warn
         from recon.commands.config import run_settings
@@ -157,6 +175,18 @@ def map_(
                 else run_map_into(into, drive, settings, options)
             )
     shared.show(shown)
+
+
+def _check(path: Path, shared: opt.Shared) -> None:
+    """Say what is in a map; of a damaged one, programs get all that is wrong, people one line."""
+    with shared.one_line_errors():
+        from recon.map.store.check import check_map_file
+
+        content = check_map_file(path)
+    if shared.json or not content.damaged:
+        shared.show(content)
+    with shared.one_line_errors():
+        content.refuse_damage()
 
 
 def piece(

@@ -27,10 +27,11 @@ from recon.look.rig import RefinedRig
 from recon.map.drive.drive import session_info
 from recon.map.drive.sequence import check_map
 from recon.map.map import Map
-from recon.map.sessions.copying import check_session, copy_sessions, keep_map, read_all
+from recon.map.sessions.copying import check_session, copy_sessions, keep_map
 from recon.map.sessions.joining import doubts_of_lengths, join_new
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
 from recon.map.sessions.placed import place_map, settings_of
+from recon.map.store.check import check_map_file
 from recon.map.store.map_file import MAP_FILE
 from recon.map.store.session import Session
 from recon.report.map_page import write_joined_page
@@ -245,8 +246,7 @@ def _damage_named(map_: Map, inputs: Sequence[Path]) -> Iterator[None]:
         if str(error.where) == map_.store.name:
             for file in inputs:
                 if file.match(MAP_FILE):
-                    with closing(Map.open(file)) as read:
-                        read_all(read)
+                    check_map_file(file).refuse_damage()
         raise
 
 
