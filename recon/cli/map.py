@@ -82,9 +82,7 @@ def map_(
     ] = None,
     check: Annotated[
         Path | None,
-        opt.option(
-            "Read every record of a map and say what is in it; without SOURCE.", metavar="RUN|FILE"
-        ),
+        opt.option("Read every record of a map (RUN or its file), and say what is in it."),
     ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
@@ -112,31 +110,22 @@ def map_(
       recon map --into outputs/map/latest --remove 1
       recon map --check outputs/map/latest
     """
-    shared_out = workers is not None or scheduler is not None
-    nothing = source is None and resume is None and remove is None
-    other_out = resume is not None and os.path.realpath(out or resume) != os.path.realpath(resume)
-    more = (source or out or resume or into or remove) is not None or bool(shared.changes)
-    for wrong, what in (
-        (check and more, "--check reads a map, and maps nothing: give it alone"),
-        (poses and prior, "--poses leaves nothing for --prior to do; give one of them"),
-        (other_out, "--out and --resume name different folders"),
-        (
-            into is not None and (resume or out) is not None,
-            "--into changes RUN, whole or not at all: no --out, no --resume",
-        ),
-        (
-            remove is not None and (into is None or source is not None),
-            "--remove takes a session out of --into RUN, and maps no SOURCE",
-        ),
-        (nothing and not check, "give SOURCE, or --resume FOLDER"),
-        (into and shared_out, "--into maps the drive in one piece: no --workers, no --scheduler"),
-        (view and (into or shared_out), "--view follows one map that grows: no --into, --workers"),
-    ):
-        if wrong:
-            raise typer.BadParameter(what)
     if check is not None:
-        _check(check, shared)
+        _check(check, (source, out, resume, into, remove, *shared.changes), shared)
         return
+    if poses is not None and prior is not None:
+        raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
+    if out is not None and resume is not None and os.path.realpath(out) != os.path.realpath(resume):
+        raise typer.BadParameter("--out and --resume name different folders")
+    if into is not None and (resume or out or workers or scheduler) is not None:
+        what = "no --out, no --resume, no --workers, no --scheduler"
+        raise typer.BadParameter(f"--into changes RUN in one piece, whole or not at all: {what}")
+    if remove is not None and (into is None or source is not None):
+        raise typer.BadParameter("--remove takes a session out of --into RUN, and maps no SOURCE")
+    if source is None and resume is None and remove is None:
+        raise typer.BadParameter("give SOURCE, or --resume FOLDER")
+    if view and (into or workers or scheduler) is not None:
+        raise typer.BadParameter("--view follows one map that grows: no --into, --workers")
     with shared.one_line_errors():
         from recon.cli.progress import warn
         from recon.commands.config import run_settings
@@ -177,15 +166,14 @@ def map_(
     shared.show(shown)
 
 
-def _check(path: Path, shared: opt.Shared) -> None:
-    """Say what is in a map; of a damaged one, programs get all that is wrong, people one line."""
+def _check(path: Path, others: tuple[Any, ...], shared: opt.Shared) -> None:
+    if any(other is not None for other in others):
+        raise typer.BadParameter("--check reads a map, and maps nothing: give it alone")
     with shared.one_line_errors():
         from recon.map.store.check import check_map_file
 
         content = check_map_file(path)
-    if shared.json or not content.damaged:
         shared.show(content)
-    with shared.one_line_errors():
         content.refuse_damage()
 
 

@@ -16,20 +16,12 @@ from recon.core.text import counted
 from recon.io.files import StrPath
 from recon.map.store.map_file import MapFile, file_of_map
 from recon.map.store.records import FORMAT, Store
-from recon.map.store.session import ENTRY, KEYFRAME, SUBMAP, Session
-from recon.map.store.trees import FRAMES, LINKS, RAYS
+from recon.map.store.session import KEYFRAME, SUBMAP, Session
+from recon.map.store.trees import LINKS, RAYS
 
-_CALLED: Final = {KEYFRAME: "keyframe", ENTRY: "submap"}  # kinds by their names for users
-_COUNTED: Final = {KEYFRAME: "frame", RAYS: "frame", FRAMES: "first frame"}
+_CALLED: Final = {KEYFRAME: "keyframe"}  # a kind by its name for users
 _SHOWN: Final = 2  # sessions in the terminal
-
-
-@dataclass(frozen=True)
-class Damage(Figures):
-    """A record that cannot be read, such as ``rays of session 0, frame 17``."""
-
-    record: str
-    why: str
+_Read = Callable[[], Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +38,11 @@ class SessionContent(Figures):
     bytes_by_kind: Mapping[str, int]
     versions: Mapping[str, str]  # that mapped it
 
+    def row(self) -> tuple[str, ...]:
+        size = f"{self.length_m:.0f} m, {_mb(sum(self.bytes_by_kind.values()))} MB"
+        shown = f"{counted(self.frames, 'frame')}, {counted(self.keyframes, 'keyframe')}, {size}"
+        return f"session {self.number}", self.name, shown
+
 
 @dataclass(frozen=True, kw_only=True)
 class MapContent(Summary):
@@ -58,35 +55,30 @@ class MapContent(Summary):
     bytes_by_kind: Mapping[str, int]
     sessions: Sequence[SessionContent]
     links: int
-    links_refused: int  # those that contradict the others
-    damaged: Sequence[Damage]
+    damaged: Mapping[str, str]  # why, by the name of the record: rays of session 0, number 17
 
     def rows(self) -> Rows:
+        if self.damaged:
+            return []
+        sizes, more = Counter(self.bytes_by_kind), len(self.sessions) - _SHOWN
         many = counted(len(self.sessions), "session"), counted(self.records, "record")
-        sizes = Counter(self.bytes_by_kind)
-        said = f"{_mb(sum(sizes.values()))} MB, all can be read"
-        kinds = ", ".join(f"{kind} {_mb(size)}" for kind, size in sizes.most_common(4))
         by = ", ".join(sorted({one.versions.get("recon", "?") for one in self.sessions}))
-        more = len(self.sessions) - _SHOWN
         return [
-            (f"{', '.join(many)}, {said}",),
+            (f"{', '.join(many)}, {_mb(sum(sizes.values()))} MB, all can be read",),
             ("map", self.file),
-            *(_row(one) for one in self.sessions[:_SHOWN]),
+            *(one.row() for one in self.sessions[:_SHOWN]),
             *([("", f"and {counted(more, 'session')} more: --json")] if more > 0 else ()),
-            (
-                "links",
-                f"{counted(self.links, 'place')} of two drives, {self.links_refused} refused",
-            ),
-            ("MB by kind", kinds),
+            ("links", f"{counted(self.links, 'place')} seen by two drives"),
+            ("MB", ", ".join(f"{kind} {_mb(n)}" for kind, n in sizes.most_common(4))),
             ("format", f"{self.format}, by recon {by}; this one reads up to {self.newest_format}"),
         ]
 
     def refuse_damage(self) -> None:
         """Raise `FormatError` for the first record that cannot be read, if there is one."""
-        if self.damaged:
-            first, *others = self.damaged
-            more = f"{counted(len(others), 'other record')} cannot be read" if others else None
-            raise FormatError(first.why, where=self.file, got=first.record, hint=more)
+        for record, why in self.damaged.items():
+            others = len(self.damaged) - 1
+            hint = f"{counted(others, 'other record')} cannot be read" if others else None
+            raise FormatError(why, where=self.file, got=record, hint=hint)
 
 
 def check_map_file(path: StrPath) -> MapContent:
@@ -98,92 +90,74 @@ def check_map_file(path: StrPath) -> MapContent:
     Raises:
         FormatError: There is no map, or one of a newer format. What is damaged is returned.
     """
+    damaged: dict[str, str] = {}
+
+    def tried(record: str, read: _Read) -> Any:
+        try:
+            return read()
+        except ReconError as error:
+            got = f": {error.got}" if record == "file" and error.got is not None else ""
+            damaged[record] = f"{error.what}{got}"
+
     file = file_of_map(path)
     with closing(Store.open(file, read_only=True)) as store:
-        damaged: list[Damage] = []
-        sizes: Counter[tuple[str, str]] = Counter()  # by session and kind
+        sizes: dict[str, Counter[str]] = {}  # by session, those of the whole map by ""
         records = store.names()
         for kind, name in tracked(records, "records", "check the records"):
-            read: Callable[[], Any] = partial(store.verify, kind, name)
+            size = tried(_record(kind, name), partial(store.verify, kind, name)) or 0
             of = "" if kind == LINKS else name.partition(",")[0]
-            sizes[of, _CALLED.get(kind, kind)] += _tried(read, kind, name, damaged) or 0
+            sizes.setdefault(of, Counter())[_CALLED.get(kind, kind)] += size
         stage("check the file")
-        _tried(store.verify_pages, "", "", damaged)
-        sessions: list[SessionContent] = []
-        links = []
-        if not damaged and (map_ := _tried(partial(MapFile, store), "", "", damaged)) is not None:
-            for kind, name, read in tracked(list(_parts(map_)), "parts", "read the map"):
-                _tried(read, kind, name, damaged)
-            if not damaged:
-                linked, links = map_.linked, map_.links
-                sessions = [_content(one, one in linked, sizes) for one in map_.sessions]
-        kinds: Counter[str] = Counter()
-        for (_, kind), size in sizes.items():
-            kinds[kind] += size
+        tried("file", store.verify_pages)
+        map_: MapFile | None = None if damaged else tried("file", partial(MapFile, store))
+        if map_ is not None:
+            for record, read in tracked(list(_parts(map_)), "parts", "read the map"):
+                tried(record, read)
+        whole = None if damaged else map_
+        linked = [] if whole is None else whole.linked
         return MapContent(
             file=str(file),
             format=store.format,
             records=len(records),
-            bytes_by_kind=kinds,
-            sessions=sessions,
-            links=sum(link.kept for link in links),
-            links_refused=sum(not link.kept for link in links),
+            bytes_by_kind=sum(sizes.values(), Counter()),
+            sessions=[_content(s, s in linked, sizes) for s in (whole.sessions if whole else ())],
+            links=len(whole.links) if whole else 0,
             damaged=damaged,
         )
 
 
-def _tried(read: Callable[[], Any], kind: str, name: str, damaged: list[Damage]) -> Any:
-    """Return what is read, or None and one more that is damaged."""
-    try:
-        return read()
-    except ReconError as error:
-        where = f": {error.got}" if error.got is not None and not kind else ""
-        damaged.append(Damage(_record(kind, name), f"{error.what}{where}"))
-        return None
-
-
-def _parts(map_: MapFile) -> Iterator[tuple[str, str, Callable[[], Any]]]:
-    """Yield kind, key and reader of what the sessions of a map do not read when it is opened."""
-    yield "", "", lambda: (map_.placed, map_.paths)
+def _parts(map_: MapFile) -> Iterator[tuple[str, _Read]]:
+    """Yield what the sessions of a map do not read when it is opened."""
+    begun = [one for one in map_.sessions if len(one)]  # others have no axes yet
+    yield "file", lambda: (map_.placed, map_.paths)
+    yield "file", lambda: [(one.camera, one.T_map_world, one.rig, one.fixes) for one in begun]
     for one in map_.sessions:
-        own = f"{one.number},"
-        yield "", "", lambda one=one: (one.rig, one.fixes)  # type: ignore[misc]
-        if len(one):  # else it has no axes yet
-            yield "", "", lambda one=one: (one.camera, one.T_map_world)  # type: ignore[misc]
-        for n in range(len(one.submaps)):
-            yield SUBMAP, f"{own}{n}", partial(one.submaps.__getitem__, n)
-        for n in one.keyframes.frames:
-            yield KEYFRAME, f"{own}{n}", partial(one.keyframes.get, n)
-        for n in map_.store.numbers(RAYS, one.number):
-            yield RAYS, f"{own}{n}", partial(one.rays, n)
+        for kind, numbers, read in (
+            (SUBMAP, range(len(one.submaps)), one.submaps.__getitem__),
+            (KEYFRAME, one.keyframes.frames, one.keyframes.get),
+            (RAYS, map_.store.numbers(RAYS, one.number), one.rays),
+        ):
+            yield from ((_record(kind, f"{one.number},{n}"), partial(read, n)) for n in numbers)
 
 
 def _record(kind: str, name: str) -> str:
-    if kind in ("", LINKS):
-        return kind or "file"
     session, _, number = name.partition(",")
-    at = f", {_COUNTED.get(kind, 'number')} {number}" if number else ""
-    return f"{_CALLED.get(kind, kind)} of session {session}{at}"
+    of = "" if kind == LINKS else f" of session {session}"
+    return f"{_CALLED.get(kind, kind)}{of}{f', number {number}' if number else ''}"
 
 
-def _content(session: Session, linked: bool, sizes: Counter[tuple[str, str]]) -> SessionContent:
+def _content(one: Session, linked: bool, sizes: Mapping[str, Mapping[str, int]]) -> SessionContent:
     return SessionContent(
-        number=session.number,
-        name=session.info.source,
-        frames=len(session),
-        length_m=session.trajectory.path_length_m if len(session) else 0.0,
+        number=one.number,
+        name=one.info.source,
+        frames=len(one),
+        length_m=one.trajectory.path_length_m if len(one) else 0.0,
         linked=linked,
-        keyframes=len(session.keyframes.frames),
-        ray_frames=session.ray_frames,
-        bytes_by_kind={kind: n for (own, kind), n in sizes.items() if own == str(session.number)},
-        versions=session.info.versions,
+        keyframes=len(one.keyframes.frames),
+        ray_frames=one.ray_frames,
+        bytes_by_kind=sizes[str(one.number)],
+        versions=one.info.versions,
     )
-
-
-def _row(one: SessionContent) -> tuple[str, ...]:
-    frames = f"{counted(one.frames, 'frame')}, {one.length_m:.0f} m"
-    size = f"{counted(one.keyframes, 'keyframe')}, {_mb(sum(one.bytes_by_kind.values()))} MB"
-    return f"session {one.number}", one.name, f"{frames}, {size}"
 
 
 def _mb(size: int) -> str:
