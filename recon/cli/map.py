@@ -170,9 +170,9 @@ def _check(path: Path, others: tuple[Any, ...], shared: opt.Shared) -> None:
     if any(other is not None for other in others):
         raise typer.BadParameter("--check reads a map, and maps nothing: give it alone")
     with shared.one_line_errors():
-        from recon.map.store.check import check_map_file
+        from recon.commands.check import check_map
 
-        content = check_map_file(path)
+        content = check_map(path)
         shared.show(content)
         content.refuse_damage()
 

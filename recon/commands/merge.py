@@ -27,11 +27,10 @@ from recon.look.rig import RefinedRig
 from recon.map.drive.drive import session_info
 from recon.map.drive.sequence import check_map
 from recon.map.map import Map
-from recon.map.sessions.copying import check_session, copy_sessions, keep_map
+from recon.map.sessions.copying import check_session, copy_sessions, keep_map, read_all
 from recon.map.sessions.joining import doubts_of_lengths, join_new
 from recon.map.sessions.measured import Survey, doubts_of_positions, hold, misfit_rms_m
 from recon.map.sessions.placed import place_map, settings_of
-from recon.map.store.check import check_map_file
 from recon.map.store.map_file import MAP_FILE
 from recon.map.store.session import Session
 from recon.report.map_page import write_joined_page
@@ -178,31 +177,37 @@ def _make_joined(
 
 
 def _figures(map_: Map, made: UsualProducts) -> JoinedSummary:
-    placed = map_.placed
     kept = [link for link in map_.links if link.kept]
     pairs = Counter("-".join(map(str, link.sessions)) for link in kept)
     return JoinedSummary(
         frames=sum(map(len, map_.linked)),
         path_length_m=sum(path.path_length_m for path in map_.paths.values()),
-        sessions=[
-            JoinedDrive(
-                number=session.number,
-                name=session.info.source,
-                frames=len(session),
-                length_m=session.trajectory.path_length_m,
-                linked=session.number in placed,
-                frames_not_trusted=int((~session.trusted).sum()),
-                frames_placed=int(placed.get(session.number, np.zeros(0)).sum()),
-                positions=len(session.fixes),
-                rig=None if (rig := _rig_of(session)) is None else rig.figures(),
-            )
-            for session in map_.sessions
-        ],
+        sessions=joined_drives(map_),
         links=LinkFigures(len(kept), len(map_.links) - len(kept), pairs),
         positions_misfit_rms_m=misfit_rms_m(map_),
         made=made,
         T_map_world=map_.first.T_map_world,
     )
+
+
+def joined_drives(map_: Map) -> list[JoinedDrive]:
+    """Return what there is of each drive that has frames."""
+    placed = map_.placed
+    return [
+        JoinedDrive(
+            number=session.number,
+            name=session.info.source,
+            frames=len(session),
+            length_m=session.trajectory.path_length_m,
+            linked=session.number in placed,
+            frames_not_trusted=int((~session.trusted).sum()),
+            frames_placed=int(placed.get(session.number, np.zeros(0)).sum()),
+            positions=len(session.fixes),
+            rig=None if (rig := _rig_of(session)) is None else rig.figures(),
+        )
+        for session in map_.sessions
+        if len(session)
+    ]
 
 
 def _rig_of(session: Session) -> RefinedRig | None:
@@ -246,7 +251,8 @@ def _damage_named(map_: Map, inputs: Sequence[Path]) -> Iterator[None]:
         if str(error.where) == map_.store.name:
             for file in inputs:
                 if file.match(MAP_FILE):
-                    check_map_file(file).refuse_damage()
+                    with closing(Map.open(file)) as read:
+                        read_all(read)
         raise
 
 

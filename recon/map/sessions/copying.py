@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -136,6 +137,15 @@ def keep_map(mapped: MapFile, path: Path) -> None:
         for kind in (AXES, RIG, LOOPS, KEYFRAME, RAYS):
             mapped.store.copy(kind, kept.store)
         kept.commit()
+
+
+def read_all(map_: MapFile) -> None:
+    """Read what `copy_sessions` copies unread, to find the record that is damaged."""
+    for session in map_.sessions:
+        for _ in chain(session.submaps, session.keyframes):
+            pass
+        for frame in map_.store.numbers(RAYS, session.number):
+            session.rays(frame)
 
 
 def check_session(session: Session, settings: DriveSettings) -> None:

@@ -2,7 +2,6 @@
 
 From the map down to the file:
 
-- `check.py`: whether every record of a file can be read, and what is in it;
 - `map_file.py`: drives in one file, and which of their frames have a place in it;
 - `session.py`: what one drive keeps: path, health, axes, submaps, keyframes, rays, loops;
 - `trees.py`: values as records of their kind, and records as JSON and bytes;
