@@ -58,12 +58,15 @@ class MapContent(Summary):
         ]
 
     def _row(self, one: JoinedDrive) -> tuple[str, ...]:
-        keyframes = counted(self.records[f"{one.number}"].get("keyframe", 0), "keyframe")
+        frames, keyframes = (
+            counted(one.frames, "frame"),
+            counted(self.records[f"{one.number}"].get("keyframe", 0), "keyframe"),
+        )
         size = f"{one.length_m:.0f} m, {_mb(sum(self.bytes[f'{one.number}'].values()))} MB"
         return (
             f"session {one.number}",
             one.name,
-            f"{counted(one.frames, 'frame')}, {keyframes}, {size}",
+            f"{frames}, {keyframes}, {size}",
         )
 
     def refuse_damage(self) -> None:

@@ -148,7 +148,7 @@ def test_the_report_shows_outliers_first_and_links_to_the_runs(folder):
     assert "trajectory.t_rel_percent 99 (usually" in page
     assert "&lt;b&gt;no images" in page
     assert "1 of 12 jobs have warnings, below" in page
-    assert re.search(r"drive0_w=9</th>\s*<td[^>]*>the lens is dirty", page)
+    assert re.search(r"drive0_<wbr>w=9</th><td>the lens is dirty", page)
 
 
 def test_the_csv_has_every_figure_and_the_table_for_people_what_any_job_has(folder):
