@@ -40,7 +40,6 @@ _TAIL_BYTES: Final = 1 << 16  # at the end of a log, in which the last try is fo
 _PROGRAM: Final = (sys.executable, "-m", "recon.run.batch.guard")
 _LOOK_S: Final = 0.2
 _OTHERS_S: Final = 90.0
-_BEGINS: Final = (b'{"try": ', b'{"event": "stage"', b'{"event": "start"', b'{"event": "finish"')
 _STARTED: Final = re.compile(rb'\{"event": "start".*"(\w+)": (\d+)\}')
 _PROGRESS: Final = b"progress: "
 LOG_S: Final = 10.0  # the log of a job has so many seconds between two of its frames
@@ -125,9 +124,11 @@ def progress_of(folder: Path, name: str) -> str:
     with suppress(OSError), log_file(folder, name).open("rb") as file:
         file.seek(-min(_TAIL_BYTES, os.fstat(file.fileno()).st_size), os.SEEK_END)
         for line in file:
-            if line.startswith(_BEGINS):
+            if line.startswith((b'{"try": ', b'{"event": "stage"')):
                 with suppress(json.JSONDecodeError):
                     stage, done = json.loads(line).get("name", ""), ""
+            elif line.startswith((b'{"event": "start"', b'{"event": "finish"')):
+                done = ""
             elif line.startswith(_PROGRESS):
                 done = line[len(_PROGRESS) :].decode(errors="replace").strip()
     return ", ".join(filter(None, (stage, done)))

@@ -31,6 +31,7 @@ TRY = Outcome("broken", "its worker died", tries=1).line()
         ),
         ([b'{"event": "start", "name": "a", "frames": 9}\n', b"progress: frames 3/9\n", TRY], ""),
         ([b"progress: frames 3/9\n", b'{"event": "finish"}\n'], ""),
+        ([b'{"event": "stage", "name": "a"}\n', b'{"event": "start", "name": "b"}\n'], "a"),
         ([b'{"event": "stage", "na'], ""),
         ([b"progress: frames \xff\n"], "frames"),
     ],
