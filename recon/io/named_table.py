@@ -34,7 +34,7 @@ Columns = dict[str, int]
 Row = tuple[str, list[str]]  # where it is, and its fields
 
 
-def read_named(path: StrPath, begin: int = 0) -> tuple[Columns, list[Row]]:
+def read_rows(path: StrPath, begin: int = 0) -> tuple[Columns, list[Row]]:
     """Return the rows of a table from a line on, and its columns by `_NAMES`.
 
     The header is the first row, or a comment before it with as many fields; no columns = there is
@@ -84,7 +84,7 @@ def columns_of(words: Sequence[str], path: StrPath) -> Columns:
     return found
 
 
-def picked(row: Row, columns: Columns, kinds: Sequence[str]) -> list[str]:
+def pick(row: Row, columns: Columns, kinds: Sequence[str]) -> list[str]:
     """Return fields of a row by their kinds; degrees, minutes and seconds become degrees."""
     where, words = row
     if missing := [kind for kind in kinds if kind not in columns]:

@@ -26,8 +26,8 @@ from recon.io.named_table import (
     fields,
     first_row,
     is_number,
-    picked,
-    read_named,
+    pick,
+    read_rows,
 )
 from recon.io.trajectory import check_positions
 
@@ -144,7 +144,7 @@ def _read_table(path: Path) -> Positions:
 
     A header may name them in any order, also latitude and longitude.
     """
-    columns, rows = read_named(path)
+    columns, rows = read_rows(path)
     degrees, count = {"lat", "lon"} <= {*columns}, len(rows[0][1]) if rows else 0
     place = ("time", "lat", "lon", "height") if degrees else ("time", "east", "north", "height")
     if not columns:
@@ -152,9 +152,7 @@ def _read_table(path: Path) -> Positions:
         columns = {kind: n for n, kind in enumerate((*place, *named))}
         rows = [(at, [str(x) for x in parse_row(row, _COUNTS, at)]) for at, row in rows]
     kinds = (*place, *(kind for kind in _SIGMAS if kind in columns))
-    table = np.array(
-        [_numbers(picked(row, columns, kinds), range(len(kinds)), path) for row in rows]
-    )
+    table = np.array([_numbers(pick(row, columns, kinds), range(len(kinds)), path) for row in rows])
     if not rows:
         raise FormatError("the file has no position", where=path)
     if not degrees:
@@ -359,7 +357,7 @@ def read_control(path: StrPath, crs: str | None = None) -> ControlPoints:
     """
     lines = read_text(path).splitlines()
     begin = next((n for n, line in enumerate(lines, 1) if _SYSTEM.match(line.strip())), 0)
-    columns, rows = read_named(path, begin)
+    columns, rows = read_rows(path, begin)
     system = first_row(lines[begin - 1]) if begin else crs
     if utm := _UTM.match(system or ""):
         system = f"EPSG:{(32600 if utm[2] in 'Nn' else 32700) + int(utm[1])}"
@@ -407,7 +405,7 @@ def _as_listed(row: Row, columns: Columns) -> list[str]:
         return [*words[1:7], words[0], *words[7:]] if named else words
     plane = ("lon", "lat") if {"lat", "lon"} <= {*columns} else ("east", "north")
     name = ("name",) if "name" in columns else ()
-    listed = picked(row, columns, (*plane, "height", "column", "row", "image", *name))
+    listed = pick(row, columns, (*plane, "height", "column", "row", "image", *name))
     at = columns.get("check", len(words))
     return [*listed, *(_CHECK for word in words[at : at + 1] if word.lower() == _CHECK)]
 

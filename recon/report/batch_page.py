@@ -71,10 +71,8 @@ def write_batch_page(
         ("Jobs per hour", known("{:.0f}", summary["jobs_per_hour"])),
     ]
     failed = [f"{one.job.name}: {one.last.error}" for one in first if one.failed]
-    many = (
-        f"{len({name for name, _ in warned})} of {counted(len(first), 'job')} have warnings, below"
-    )
-    warnings = [*failed, *([many] if warned else ())]
+    many = counted(len({name for name, _ in warned}), "job")
+    warnings = [*failed, *([f"warnings of {many} are below"] if warned else ())]
     title = f"Batch: {summary['succeeded']} of {len(summary['jobs'])} jobs"
     subtitle = f"{summary['failed']} failed, {summary['seconds']:.0f} s"
     write_page(Page(title, subtitle, figures, sections, summary, warnings), run)
@@ -105,17 +103,8 @@ def batch_csv(results: Sequence[JobResult]) -> str:
     swept = list(dict.fromkeys(key for one in results for key in one.job.swept))
     names = list(dict.fromkeys(key for one in results for key in one.figures))
     facts = (
-        "name",
-        "command",
-        "source",
-        "state",
-        "tries",
-        "seconds",
-        "bytes",
-        "error",
-        "date",
-        "warnings",
-    )
+        "name", "command", "source", "state", "tries", "seconds", "bytes", "error", "date",
+    )  # fmt: skip
     rows = [
         [found.get(key, "") for found, keys in parts for key in keys]
         for parts in (

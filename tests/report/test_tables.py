@@ -147,7 +147,7 @@ def test_the_report_shows_outliers_first_and_links_to_the_runs(folder):
     assert 'href="later' not in page
     assert "trajectory.t_rel_percent 99 (usually" in page
     assert "&lt;b&gt;no images" in page
-    assert "1 of 12 jobs have warnings, below" in page
+    assert "warnings of 1 job are below" in page
     assert re.search(r"drive0_<wbr>w=9</th><td>the lens is dirty", page)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -163,7 +164,8 @@ def _told(jobs: Sequence[Job], folder: Path) -> Iterator[None]:
     def tell() -> None:
         while not ended.wait(LOG_S):
             seen = ((job.name, progress_of(folder, job.name)) for job in jobs)
-            stage("; ".join(f"{name}: {doing}" for name, doing in seen if doing))
+            if said := "; ".join(f"{name}: {doing}" for name, doing in seen if doing):
+                stage(said)
 
     thread = threading.Thread(target=copy_context().run, args=(tell,), daemon=True)
     thread.start()
@@ -195,8 +197,16 @@ def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
         if (length_m := figures.get("path_length_m")) and map_.is_file():
             figures.setdefault("map_mb_per_km", map_.stat().st_size / 1e3 / length_m)
         dates = (summary, *summary.get("sessions", ()))
-        date = max(str(one.get("date") or "") for one in dates)
+        date = max(_date(one.get("date")) for one in dates)
         return JobResult(job, outcome, figures, warnings, remark, size, date=date)
+
+
+def _date(text: Any) -> str:
+    """Return a date and time as it is written, to the second; "" = it is none."""
+    with suppress(ValueError, TypeError):
+        datetime.fromisoformat(text[:19])
+        return str(text[:19])
+    return ""
 
 
 def runs_by_date(paths: Iterable[Path], folder: Path) -> list[JobResult]:
@@ -215,7 +225,8 @@ def runs_by_date(paths: Iterable[Path], folder: Path) -> list[JobResult]:
             one = result_of(job, Outcome("succeeded", tries=1), folder)
             with reading(run / RECORD):
                 mapped = json.loads(read_text(run / RECORD, RECORD_BYTES)).get("finished_utc", "")
-            found.append(one if one.date else replace(one, date=f"{mapped[:19]} (mapped)"))
+            mapped = _date(mapped) and f"{_date(mapped)} (mapped)"
+            found.append(replace(one, date=one.date or mapped))
     if not found:
         raise SettingsError("there is no run", where="--table", expected="folders of finished runs")
     return sorted(found, key=lambda one: one.date)
@@ -315,7 +326,8 @@ def _seen(job: Job, folder: Path, *, running: bool) -> JobResult:
         # A try that has not ended is written as one that broke.
         if running and last.state == "broken" and not last.seconds:
             last = replace(last, state="running", error="")
-            return JobResult(job, last, progress=progress_of(folder, job.name))
+            doing = progress_of(folder, job.name)
+            return replace(result_of(job, last, folder), progress=doing)
         return result_of(job, last, folder)
     except FormatError:
         return JobResult(job, last)

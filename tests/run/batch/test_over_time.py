@@ -112,6 +112,9 @@ def test_storage_of_runs_that_do_not_say_it_and_dates_of_several_drives(tmp_path
     one, other = runs_by_date([late, out], tmp_path)
     assert (one.date, one.figures["map_mb_per_km"]) == ("2026-03-01", 2.0)
     assert other.date == "2026-11-30T10:00:00 (mapped)"
+    (late / "run.json").write_text('{"finished_utc": "in autumn"}')
+    assert runs_by_date([late], tmp_path)[0].date == ""
+    assert not time_figure([*runs_by_date([late], tmp_path), one])
     assert "map_mb_per_km" not in other.figures
 
 
@@ -129,7 +132,7 @@ def test_the_table_of_runs(weeks, tmp_path):
     assert "map_mb_per_km" in head
     assert first.startswith("| ../weeks/w3 | 2026-01-01T10:00:00 |")
     page = (out / "report.html").read_text()
-    assert "3 of 4 jobs have warnings, below" in page
+    assert "warnings of 3 jobs are below" in page
     assert 'href="../weeks/w3/summary.json"' in page
     assert page.index("../weeks/w3") < page.index("../weeks/w0")
     assert (out / "time.png").stat().st_size > 1000
