@@ -26,10 +26,11 @@ _COLUMNS: Final = (
     "frames_not_trusted", "points", "peak_memory_mb", "expected_drift_percent", "map_mb_per_km",
     "changes.came", "changes.went", "warnings",
 )  # fmt: skip
-_OVER_TIME: Final = (
-    "expected_drift_percent", "frames_not_trusted", "map_mb_per_km", "changes.came", "changes.went",
-    "warnings",
-)  # fmt: skip
+_OVER_TIME: Final = {
+    "expected_drift_percent": "drift, %", "frames_not_trusted": "not trusted",
+    "map_mb_per_km": "MB per km", "changes.came": "came", "changes.went": "went",
+    "warnings": "warnings",
+}  # fmt: skip
 _PANEL_IN: Final = 3.2
 _JOBS: Final = (
     "Failed ones first, then those with the largest fraction of frames that are not trusted, then "
@@ -119,17 +120,19 @@ def batch_csv(results: Sequence[JobResult]) -> str:
 def time_figure(results: Sequence[JobResult]) -> bytes:
     """Draw drift, trust, storage, changes and warnings by date; empty of one."""
     dated = sorted((one for one in results if one.date and one.ok), key=lambda one: one.date)
-    shown: dict[str, list[float]] = {
-        name: [one.figures.get(name, np.nan) for one in dated] for name in _OVER_TIME
+    shown = {
+        label: [one.figures.get(name, np.nan) for one in dated]
+        for name, label in _OVER_TIME.items()
     }
-    shown["MB"] = [one.bytes / 1e6 for one in dated]
-    shown = {name: values for name, values in shown.items() if np.isfinite(values).any()}
+    shown = {label: values for label, values in shown.items() if np.isfinite(values).any()}
     if len({one.date[:19] for one in dated}) < 2:
         return b""
+    shown["MB"] = [one.bytes / 1e6 for one in dated]
     days = [np.datetime64(one.date[:19]) for one in dated]
     figure, panels = style.stacked(_PANEL_IN * len(shown) / 2, "", [*shown])
     for axes, values in zip(panels, shown.values(), strict=True):
         axes.plot(days, values, "o-", markersize=4)
+        axes.set_ylim(0.0, 1.1 * np.nanmax(values) or 1.0)
     return style.to_png(figure)
 
 
