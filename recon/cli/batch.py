@@ -25,6 +25,9 @@ def batch(
         Path | None,
         opt.option("Show how the batch in this folder stands, until it ends; from any terminal."),
     ] = None,
+    table: Annotated[
+        bool, opt.option("Make the tables of finished runs or batches, by date.", "--table")
+    ] = False,
     scheduler: opt.Scheduler = None,
     workers: Annotated[
         int | None, opt.option("Workers on this machine.", default="one per core", min=1)
@@ -68,6 +71,7 @@ def batch(
       recon batch jobs.toml --scheduler tcp://head:8786 --timeout 7200
       recon batch --resume outputs/week
       recon batch --watch outputs/week
+      recon batch --table outputs/monday outputs/friday --out outputs/table
     """
     if [bool(what), resume is not None, watch is not None].count(True) != 1:
         raise typer.BadParameter("give JOBS, COMMAND and SOURCES, --resume or --watch FOLDER")
@@ -78,8 +82,13 @@ def batch(
             show_batch(watch)
             return
         from recon.cli.program import plan_jobs
-        from recon.commands.batch import run_batch
+        from recon.commands.batch import run_batch, run_table
         from recon.core.progress import stage
+
+        if table:
+            found = run_table([Path(run) for run in what or ()], out)
+            print_batch(found, as_json=json, verbose=verbose)
+            return
         from recon.run.batch.cluster import BatchOptions
         from recon.run.batch.job_file import SUFFIXES, jobs_of_sources, read_jobs, read_plan
 

@@ -112,6 +112,10 @@ def map_(
             default="by stamps or files",
         ),
     ] = None,
+    check: Annotated[
+        Path | None,
+        opt.option("Read every record of a map (RUN or its file), and say what is in it."),
+    ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
     view: View = False,
@@ -137,7 +141,12 @@ def map_(
       recon map rides/tomorrow --into outputs/map/latest
       recon map --into outputs/map/latest --remove 1
       recon map --into outputs/map/latest --keep 2 --keep 90d
+      recon map --check outputs/map/latest
     """
+    if check is not None:
+        others = (source, out, resume, into, remove, keep, date, *shared.changes)
+        _check(check, others, shared)
+        return
     if poses is not None and prior is not None:
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     if out is not None and resume is not None and os.path.realpath(out) != os.path.realpath(resume):
@@ -189,6 +198,17 @@ def map_(
                 else run_map_into(into, drive, settings, options)
             )
     shared.show(shown)
+
+
+def _check(path: Path, others: tuple[Any, ...], shared: opt.Shared) -> None:
+    if any(other is not None for other in others):
+        raise typer.BadParameter("--check reads a map, and maps nothing: give it alone")
+    with shared.one_line_errors():
+        from recon.commands.check import check_map
+
+        content = check_map(path)
+        shared.show(content)
+        content.refuse_damage()
 
 
 def piece(

@@ -116,7 +116,7 @@ Threads = Annotated[
 ]
 POSITIONS = (
     " NMEA, RTKLIB, an OXTS folder, a ROS bag with NavSatFix (BAG or BAG:/TOPIC), rows of time, "
-    "easting, northing, height (s, m); for export also control points (gcp_list.txt)."
+    "easting, northing, height (s, m), or a header; for export also control points."
 )
 SOURCES_HELP = (
     "KITTI (odometry or raw), EuRoC or TUM sequence, folder with left and right images, video, "

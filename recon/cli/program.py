@@ -27,7 +27,7 @@ COMMANDS: Final = (
 _WITHOUT_SOURCE: Final = ("demo",)
 _NOT_OPTIONS: Final = frozenset(
     ("--out", "--resume", "--json", "--latex", "--quiet", "--into", "--remove", "--repair",
-     "--picture")
+     "--picture", "--check")
 )  # fmt: skip
 """A job writes into its own folder alone, and says what the batch reads."""
 # Typer has a copy of click in it, or uses the one that is installed.

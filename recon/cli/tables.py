@@ -114,14 +114,15 @@ def batch_table(all_jobs: Sequence[JobSummary]) -> Table:
 
     table, jobs = Table(show_edge=False, pad_edge=False), all_jobs[:_MOST_JOBS]
     judged = accuracies(job.figures for job in jobs)
-    for title in ("job", "state", "tries", "s", "MB", *judged):
+    for title in ("job", "state", "tries", "s", "MB", *judged, "warnings"):
         table.add_column(re.sub(r"(?<=[a-z])[._]", " ", title), overflow="fold")
     for job in jobs:
         facts = job.facts
         times = (str(facts.tries), f"{facts.seconds:.1f}", f"{facts.bytes / 1e6:.1f}")
+        state = ": ".join(filter(None, (facts.state, facts.progress)))
         figures = (job.figures.get(name) for name in judged)
         found = ("" if value is None else f"{value:.4g}" for value in figures)
-        table.add_row(*map(Text, (facts.name, facts.state, *times, *found)))
+        table.add_row(*map(Text, (facts.name, state, *times, *found, str(len(job.warnings)))))
     return table
 
 

@@ -41,8 +41,8 @@ def _list_changes(rounds: Iterator[list[JobResult]]) -> None:
     shown: dict[str, tuple[Any, ...]] = {}
     for results in rounds:
         for one in results:
-            now = one.facts.state, one.last.tries
-            if shown.get(one.job.name, ("not run", 0)) != now:
-                why = f": {one.last.error}" if one.failed else ""
+            now = one.facts.state, one.last.tries, one.progress
+            if shown.get(one.job.name, ("not run", 0, "")) != now:
+                why = f": {one.last.error if one.failed else one.progress}".removesuffix(": ")
                 typer.echo(f"{one.job.name}: {now[0]}, try {now[1]}, {one.seconds:.1f} s{why}")
             shown[one.job.name] = now

@@ -15,7 +15,15 @@ from recon.report.batch_page import write_batch_page
 from recon.run.batch.cluster import BatchOptions
 from recon.run.batch.job import Job, is_done, last_outcome
 from recon.run.batch.job_file import PLAN, JobList
-from recon.run.batch.results import JobResult, JobSummary, compare, result_of, urgency, work_off
+from recon.run.batch.results import (
+    JobResult,
+    JobSummary,
+    compare,
+    result_of,
+    runs_by_date,
+    urgency,
+    work_off,
+)
 from recon.run.directory import default_folder
 from recon.run.run import Run
 
@@ -52,6 +60,16 @@ def run_batch(
         with run.report(summary) as summary:
             write_batch_page(results, summary.to_json(), run)
         return run.finish(summary, source=f"{len(jobs)} jobs", inputs=[folder / PLAN])
+
+
+def run_table(runs: Sequence[Path], out: Path | None = None) -> BatchSummary:
+    """Make the tables and the report of a batch of runs that are there: `recon batch --table`."""
+    folder = resolved(out or default_folder("batch"))
+    results = compare(runs_by_date(runs, folder))
+    with Run("batch", folder) as run:
+        with run.report(_summary(results, 0, 0.0)) as summary:
+            write_batch_page(results, summary.to_json(), run)
+        return run.finish(summary, source=counted(len(results), "run"), inputs=())
 
 
 @dataclass(frozen=True, kw_only=True)

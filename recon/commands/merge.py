@@ -195,30 +195,12 @@ def _make_joined(
 
 
 def _figures(map_: Map, made: UsualProducts, tended: str) -> JoinedSummary:
-    placed = map_.placed
     kept = [link for link in map_.links if link.kept]
     pairs = Counter("-".join(map(str, link.sessions)) for link in kept)
     return JoinedSummary(
         frames=sum(map(len, map_.linked)),
         path_length_m=sum(path.path_length_m for path in map_.paths.values()),
-        sessions=[
-            JoinedDrive(
-                number=session.number,
-                name=session.info.source,
-                frames=len(session),
-                length_m=session.trajectory.path_length_m,
-                linked=session.number in placed,
-                frames_not_trusted=int((~session.trusted).sum()),
-                frames_placed=int(placed.get(session.number, np.zeros(0)).sum()),
-                positions=len(session.fixes),
-                rig=None if (rig := _rig_of(session)) is None else rig.figures(),
-                date=session.date.text,
-                date_from=session.date.known_from,
-                rays_kept=1.0 if (left := session.thinned) is None else left.rays_ratio,
-                keyframes_kept=1.0 if left is None else left.keyframes_ratio,
-            )
-            for session in map_.sessions
-        ],
+        sessions=joined_drives(map_),
         forgotten=map_.forgotten,
         map_mb_per_km=map_.mb_per_km,
         tended=tended,
@@ -227,6 +209,30 @@ def _figures(map_: Map, made: UsualProducts, tended: str) -> JoinedSummary:
         made=made,
         T_map_world=map_.first.T_map_world,
     )
+
+
+def joined_drives(map_: Map) -> list[JoinedDrive]:
+    """Return what there is of each drive that has frames."""
+    placed = map_.placed
+    return [
+        JoinedDrive(
+            number=session.number,
+            name=session.info.source,
+            frames=len(session),
+            length_m=session.trajectory.path_length_m,
+            linked=session.number in placed,
+            frames_not_trusted=int((~session.trusted).sum()),
+            frames_placed=int(placed.get(session.number, np.zeros(0)).sum()),
+            positions=len(session.fixes),
+            rig=None if (rig := _rig_of(session)) is None else rig.figures(),
+            date=session.date.text,
+            date_from=session.date.known_from,
+            rays_kept=1.0 if (left := session.thinned) is None else left.rays_ratio,
+            keyframes_kept=1.0 if left is None else left.keyframes_ratio,
+        )
+        for session in map_.sessions
+        if len(session)
+    ]
 
 
 def _rig_of(session: Session) -> RefinedRig | None:

@@ -17,17 +17,22 @@ import numpy as np
 from recon.core.errors import EvaluationError, FormatError, require
 from recon.core.text import counted, parse_numbers
 from recon.core.values.arrays import Float64
-from recon.io.files import StrPath, read_lines, read_table, read_text, reader, seconds_of_date
+from recon.io.files import StrPath, parse_row, read_lines, read_text, reader, seconds_of_date
 from recon.io.models.las import check_crs
+from recon.io.named_table import (
+    Columns,
+    Row,
+    columns_of,
+    fields,
+    first_row,
+    is_number,
+    pick,
+    read_rows,
+)
 from recon.io.trajectory import check_positions
 
-_NAMES: Final = {
-    "time": ("time", "t", "timestamp", "time_s", "timestamp_s", "seconds"),
-    "lat": ("lat", "latitude", "lat_deg", "latitude_deg"),
-    "lon": ("lon", "lng", "long", "longitude", "lon_deg", "longitude_deg"),
-    "height": ("alt", "altitude", "height", "ele", "elevation", "h", "alt_m", "height_m"),
-    "sigma": ("sigma", "sigma_m", "accuracy"),
-}
+_COUNTS: Final = (4, 5, 7, 8)  # columns of a table without a header; 8 of TUM
+_SIGMAS: Final = ("sigma", "sigma_e", "sigma_n", "sigma_u")
 # Standard deviations of a horizontal coordinate in metres at a dilution of precision of 1, by the
 # quality that NMEA 0183 states in GGA: autonomous, differential, RTK fixed, RTK floating.
 _NMEA_SIGMA_M: Final = {1: 5.0, 2: 1.0, 4: 0.02, 5: 0.3}
@@ -110,8 +115,7 @@ def read_positions(path: StrPath) -> Positions:
         return in_order(_read_nmea(place), place)
     if first.startswith("%"):
         return in_order(_read_rtklib(place), place)
-    columns = _columns_of(first)
-    return in_order(_read_table(place) if columns is None else _read_named(place, columns), place)
+    return in_order(_read_table(place), place)
 
 
 def in_order(found: Positions, path: StrPath) -> Positions:
@@ -136,45 +140,29 @@ def in_order(found: Positions, path: StrPath) -> Positions:
 
 
 def _read_table(path: Path) -> Positions:
-    """Read rows of time, easting, northing, height, and perhaps one or three deviations."""
-    table, lines = read_table(path, (4, 5, 7, 8))
-    check_positions(table[:, 1:4], lines, path)
-    sigma_m = np.full((len(table), 3), np.nan)
-    if table.shape[1] in (5, 7):
-        sigma_m[:] = table[:, 4:]
-        if not (sigma_m > 0.0).all():
-            raise FormatError("a standard deviation is not above 0", where=path)
-    return Positions(table[:, 0], table[:, 1:4], sigma_m)
+    """Read rows of time, easting, northing, height, and perhaps one or three deviations.
 
-
-def _columns_of(line: str) -> dict[str, int] | None:
-    """Return which columns a line of names has; None if it does not name latitude and longitude."""
-    words = [word.strip("\"'").lower() for word in line.lstrip("# ").replace(",", " ").split()]
-    found = {
-        name: next((n for n, word in enumerate(words) if word in known), -1)
-        for name, known in _NAMES.items()
-    }
-    return found if min(found["lat"], found["lon"]) >= 0 else None
-
-
-def _read_named(path: Path, columns: dict[str, int]) -> Positions:
-    missing = [name for name in ("time", "height") if columns[name] < 0]
-    if missing:
-        what, expected = "the header lacks a column", "time, lat, lon, height (and sigma)"
-        raise FormatError(what, where=path, got=f"no {missing[0]}", expected=expected)
-    rows = [
-        line.replace(",", " ").split()
-        for line in read_lines(path)[1:]
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    used = [columns[name] for name in ("time", "lat", "lon", "height", "sigma")]
-    table = np.array([_numbers(row, [n for n in used if n >= 0], path) for row in rows])
-    if not len(table):
+    A header may name them in any order, also latitude and longitude.
+    """
+    columns, rows = read_rows(path)
+    degrees, count = {"lat", "lon"} <= {*columns}, len(rows[0][1]) if rows else 0
+    place = ("time", "lat", "lon", "height") if degrees else ("time", "east", "north", "height")
+    if not columns:
+        named = {5: _SIGMAS[:1], 7: _SIGMAS[1:]}.get(count, ())
+        columns = {kind: n for n, kind in enumerate((*place, *named))}
+        rows = [(at, [str(x) for x in parse_row(row, _COUNTS, at)]) for at, row in rows]
+    kinds = (*place, *(kind for kind in _SIGMAS if kind in columns))
+    table = np.array([_numbers(pick(row, columns, kinds), range(len(kinds)), path) for row in rows])
+    if not rows:
         raise FormatError("the file has no position", where=path)
+    if not degrees:
+        check_positions(table[:, 1:4], [int(at.rpartition(":")[2]) for at, _ in rows], path)
     sigma_m = np.full((len(table), 3), np.nan)
-    if table.shape[1] == 5:
+    if table.shape[1] > 4:
         sigma_m[:] = table[:, 4:]
-    return Positions(table[:, 0], table[:, 1:4], sigma_m, degrees=True)
+        if not (degrees or (sigma_m > 0.0).all()):
+            raise FormatError("a standard deviation is not above 0", where=path)
+    return Positions(table[:, 0], table[:, 1:4], sigma_m, degrees=degrees)
 
 
 def _numbers(words: Sequence[str], columns: Sequence[int], path: Path) -> list[float]:
@@ -343,11 +331,13 @@ class ControlPoints:
 
 
 def is_control(path: StrPath) -> bool:
-    """Return whether a file begins with a coordinate system, as lists of control points do."""
+    """Return whether a file begins with a coordinate system, or a header that names images."""
     if not Path(path).is_file():
         return False
-    with Path(path).open("rb") as file:
-        return bool(_SYSTEM.match(file.read(200).decode("utf-8-sig", errors="replace").lstrip()))
+    with Path(path).open("rb") as file, suppress(FormatError):
+        first = first_row(file.read(4000).decode("utf-8-sig", errors="replace"))
+        return bool(_SYSTEM.match(first)) or "image" in columns_of(fields(first), path)
+    return False
 
 
 @reader
@@ -356,23 +346,30 @@ def read_control(path: StrPath, crs: str | None = None) -> ControlPoints:
 
     The first line is a coordinate system; the others are ``x y z column row image [name]``, in
     degrees longitude and latitude if the system has those, else metres; ``check`` behind the name
-    makes it a check point. Rows of one name, or without one of one place, are one point. ``crs`` is
-    the system to convert degrees to (None = that of UTM), or for the system of the file.
+    makes it a check point. A name may come first, and a header names columns in any order. Rows of
+    one name, or without one of one place, are one point. ``crs`` is the system to convert degrees
+    to (None = that of UTM), or for the system of the file, which a header may do without.
 
     Raises:
         FormatError: A row is not as above, or rows of one name have different places.
 
     Ref: https://docs.opendronemap.org/gcp/
     """
-    lines = [line.split() for line in read_lines(path)]
-    rows = [(n, words) for n, words in enumerate(lines, 1) if words and words[0][0] != "#"]
-    system = " ".join(rows[0][1])
-    if utm := _UTM.match(system):
+    lines = read_text(path).splitlines()
+    begin = next((n for n, line in enumerate(lines, 1) if _SYSTEM.match(line.strip())), 0)
+    columns, rows = read_rows(path, begin)
+    system = first_row(lines[begin - 1]) if begin else crs
+    if utm := _UTM.match(system or ""):
         system = f"EPSG:{(32600 if utm[2] in 'Nn' else 32700) + int(utm[1])}"
+    degrees = {"lat", "lon"} <= {*columns}
+    system = "EPSG:4326" if degrees and not begin else system
+    if system is None:
+        what, expected = "no coordinate system", "a first line such as EPSG:25832, or --crs"
+        raise FormatError(what, where=path, expected=expected)
     named: dict[str, list[_Row]] = {}
-    for number, words in rows[1:]:
-        row = _row(words, f"{path}:{number}")
-        named.setdefault(row.name or " ".join(words[:3]), []).append(row)
+    for each in rows:
+        row = _row(_as_listed(each, columns), each[0])
+        named.setdefault(row.name or f"{row.numbers[:3]}", []).append(row)
     if not named:
         raise FormatError("the file has no control point", where=path)
     for name, (first, *others) in named.items():
@@ -380,7 +377,7 @@ def read_control(path: StrPath, crs: str | None = None) -> ControlPoints:
             got = f"{first.numbers[:3]} and others"
             raise FormatError("one point has several places", where=f"{path}: {name}", got=got)
     firsts = np.array([found[0].numbers[:3] for found in named.values()], np.float64)
-    places_m, system = _in_metres(firsts, system, crs, path)
+    places_m, system = _in_metres(firsts, system, crs, path, degrees=degrees)
     points = (
         ControlPoint(
             found[0].name or f"point {number}",
@@ -400,6 +397,19 @@ class _Row(NamedTuple):
     check: bool
 
 
+def _as_listed(row: Row, columns: Columns) -> list[str]:
+    """Return a row in the order of OpenDroneMap's list."""
+    words = row[1]
+    if not columns:
+        named = len(words) > 6 and not is_number(words[0])
+        return [*words[1:7], words[0], *words[7:]] if named else words
+    plane = ("lon", "lat") if {"lat", "lon"} <= {*columns} else ("east", "north")
+    name = ("name",) if "name" in columns else ()
+    listed = pick(row, columns, (*plane, "height", "column", "row", "image", *name))
+    at = columns.get("check", len(words))
+    return [*listed, *(_CHECK for word in words[at : at + 1] if word.lower() == _CHECK)]
+
+
 def _row(words: list[str], where: str) -> _Row:
     name, *more = words[6:] or [""]
     if len(words) < 6 or more not in ([], [_CHECK]):
@@ -414,7 +424,9 @@ def _row(words: list[str], where: str) -> _Row:
     return _Row(numbers, words[5], name, bool(more))
 
 
-def _in_metres(places: Float64, system: str, crs: str | None, path: StrPath) -> tuple[Float64, str]:
+def _in_metres(
+    places: Float64, system: str, crs: str | None, path: StrPath, *, degrees: bool
+) -> tuple[Float64, str]:
     pyproj = require("pyproj", extra="survey")
     try:
         geographic = pyproj.CRS.from_user_input(system).is_geographic
@@ -422,7 +434,9 @@ def _in_metres(places: Float64, system: str, crs: str | None, path: StrPath) -> 
         raise FormatError("unknown coordinate system", where=path, got=system) from error
     if not geographic:
         check_crs(system, path)
-        return places, crs or system
-    degrees = Positions(np.zeros(len(places)), places[:, [1, 0, 2]], np.zeros((0, 3)), degrees=True)
-    metres, chosen = degrees.projected(crs, path)
+        if not degrees:
+            return places, crs or system
+        crs = crs or system
+    found = Positions(np.zeros(len(places)), places[:, [1, 0, 2]], np.zeros((0, 3)), degrees=True)
+    metres, chosen = found.projected(crs, path)
     return metres, str(chosen)

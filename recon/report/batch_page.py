@@ -10,20 +10,27 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.axes import Axes
 
+from recon.core.text import counted
 from recon.io.atomic import write_bytes, write_text
 from recon.report import style
 from recon.report.page import write_page
 from recon.report.sections import NOT_KNOWN, Image, Page, Section, Table, csv_text, join, known
 from recon.run.batch.job import LOGS
-from recon.run.batch.results import JobResult, accuracies, wrong_first
+from recon.run.batch.results import RUNS, JobResult, accuracies, wrong_first
 from recon.run.directory import RunDirectory
 
 #: Columns of the tables for people, where any job has them; the CSV has every figure.
 _COLUMNS: Final = (
     "trajectory.t_rel_percent", "trajectory.ate_m", "map.f_score", "t_rel_percent", "f_score",
     "disparity.bad.2.0", "bad.2.0", "valid_percent", "frames", "path_length_m",
-    "frames_not_trusted", "points", "peak_memory_mb",
+    "frames_not_trusted", "points", "peak_memory_mb", "expected_drift_percent", "map_mb_per_km",
+    "changes.came", "changes.went", "warnings",
 )  # fmt: skip
+_OVER_TIME: Final = {
+    "expected_drift_percent": "drift, %", "frames_not_trusted": "not trusted",
+    "map_mb_per_km": "MB per km", "changes.came": "came", "changes.went": "went",
+    "warnings": "warnings",
+}  # fmt: skip
 _PANEL_IN: Final = 3.2
 _JOBS: Final = (
     "Failed ones first, then those with the largest fraction of frames that are not trusted, then "
@@ -44,13 +51,19 @@ def write_batch_page(
     sweep = sweep_figure(results)
     if sweep:
         write_bytes(run.path("sweep.png"), sweep)
-    first = wrong_first(results)
+    if over_time := time_figure(results):
+        write_bytes(run.path("time.png"), over_time)
+    in_order = results[0].job.command == RUNS
+    first = results if in_order else wrong_first(results)
     links = {one.job.name: _link(one, run.folder) for one in first}
     tables = [replace(table, links=links) for table in batch_tables(first)]
+    warned = [(one.job.name, text) for one in first for text in one.warnings]
     what = "A point is a job, the line goes through the medians; other swept settings vary along."
     sections = [
         Section("Sweep", [Image("What each setting did", sweep, what)]),
-        Section("Jobs", tables, _JOBS),
+        Section("Over time", [Image("What changed from run to run", over_time)]),
+        Section("Jobs", tables, "" if in_order else _JOBS),
+        Section("Warnings", [Table("By job", ("job", "warning"), warned)]),
     ]
     figures = [
         ("Jobs that succeeded", str(summary["succeeded"])),
@@ -59,7 +72,8 @@ def write_batch_page(
         ("Jobs per hour", known("{:.0f}", summary["jobs_per_hour"])),
     ]
     failed = [f"{one.job.name}: {one.last.error}" for one in first if one.failed]
-    warnings = [*failed, *summary["warnings"]]
+    many = counted(len({name for name, _ in warned}), "job")
+    warnings = [*failed, *([f"warnings of {many} are below"] if warned else ())]
     title = f"Batch: {summary['succeeded']} of {len(summary['jobs'])} jobs"
     subtitle = f"{summary['failed']} failed, {summary['seconds']:.0f} s"
     write_page(Page(title, subtitle, figures, sections, summary, warnings), run)
@@ -73,21 +87,25 @@ def batch_tables(results: Sequence[JobResult]) -> list[Table]:
 def _table(command: str, results: Sequence[JobResult]) -> Table:
     jobs = [one for one in results if one.job.command == command]
     columns = [name for name in _COLUMNS if any(name in one.figures for one in jobs)]
-    rows = []
+    rows, dated = [], any(one.date for one in jobs)
     for one in jobs:
         facts, figures = one.facts, (one.figures.get(name, NOT_KNOWN) for name in columns)
         cells = (f"{x:.4g}" if isinstance(x, float) else str(x) for x in figures)
         spent = (f"{one.seconds:.1f}", f"{one.bytes / 1e6:.1f}")
         shown = (facts.state, str(facts.tries), *spent)
-        rows.append((one.job.name, one.last.error or one.remark, *shown, *cells))
-    return Table(command, ("job", "remark", "state", "tries", "seconds", "MB", *columns), rows)
+        date = [one.date or NOT_KNOWN] if dated else []
+        rows.append((one.job.name, *date, one.last.error or one.remark, *shown, *cells))
+    head = ("job", *(["date"] if dated else ()), "remark", "state", "tries", "seconds", "MB")
+    return Table(command, (*head, *columns), rows)
 
 
 def batch_csv(results: Sequence[JobResult]) -> str:
     """Return the table for programs: every swept setting and every figure of every job."""
     swept = list(dict.fromkeys(key for one in results for key in one.job.swept))
     names = list(dict.fromkeys(key for one in results for key in one.figures))
-    facts = ("name", "command", "source", "state", "tries", "seconds", "bytes", "error")
+    facts = (
+        "name", "command", "source", "state", "tries", "seconds", "bytes", "error", "date",
+    )  # fmt: skip
     rows = [
         [found.get(key, "") for found, keys in parts for key in keys]
         for parts in (
@@ -96,6 +114,26 @@ def batch_csv(results: Sequence[JobResult]) -> str:
         )
     ]
     return csv_text([["job", *facts[1:], *swept, *names], *rows])
+
+
+@style.styled
+def time_figure(results: Sequence[JobResult]) -> bytes:
+    """Draw drift, trust, storage, changes and warnings by date; empty of one."""
+    dated = sorted((one for one in results if one.date and one.ok), key=lambda one: one.date)
+    shown = {
+        label: [one.figures.get(name, np.nan) for one in dated]
+        for name, label in _OVER_TIME.items()
+    }
+    shown = {label: values for label, values in shown.items() if np.isfinite(values).any()}
+    if len({one.date[:19] for one in dated}) < 2:
+        return b""
+    shown["MB"] = [one.bytes / 1e6 for one in dated]
+    days = [np.datetime64(one.date[:19]) for one in dated]
+    figure, panels = style.stacked(_PANEL_IN * len(shown) / 2, "", [*shown])
+    for axes, values in zip(panels, shown.values(), strict=True):
+        axes.plot(days, values, "o-", markersize=4)
+        axes.set_ylim(0.0, 1.1 * np.nanmax(values) or 1.0)
+    return style.to_png(figure)
 
 
 @style.styled

@@ -45,7 +45,6 @@ COMMAS = {
     "a quaternion": (read_trajectory, "0,1 1,5 2,0 3,0\n"),
     "a header": (read_tum, "t;x;y;z;qx;qy;qz;qw\n0,1;1,5;2,0;3,0;0,0;0,0;0,0;1,0\n"),
     "positions": (read_positions, "0 1 2 3\n1 1 2 3,5\n"),
-    "a spreadsheet": (read_positions, "time;lat;lon;height\n0,5;48,1;11,2;500,1\n"),
     "RTKLIB": (read_positions, "% GPST latitude(deg)\n2020/01/01 00:00:00.000 35,1 139,7 50,1\n"),
     "images": (read_stamped_names, "0.1 a.png\n0,2 b.png\n"),
     "control points": (read_control, GCP + "500000 5000000 400,25 100 200 a.png p1\n"),

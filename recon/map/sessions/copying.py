@@ -168,7 +168,7 @@ def read_all(map_: MapFile) -> None:
     for session in map_.sessions:
         for _ in chain(session.submaps, session.keyframes):
             pass
-        for frame in range(session.ray_frames):
+        for frame in map_.store.numbers(RAYS, session.number):
             session.rays(frame)
 
 

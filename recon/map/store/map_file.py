@@ -26,6 +26,18 @@ from recon.places.detector import KnownPlaces, KnownView
 MAP_FILE: Final = "map/map.recon"  # where a finished run keeps its map
 
 
+def file_of_map(path: StrPath) -> Path:
+    """Return the file of a map, which may be named by the folder of its run."""
+    file = Path(path)
+    if not file.is_dir():
+        return file
+    if not (file / MAP_FILE).is_file():
+        expected = f"a {MAP_FILE}, as recon map, live and merge keep it"
+        raise FormatError("folder has no map", where=path, expected=expected)
+    refuse_links(file)
+    return file / MAP_FILE
+
+
 class MapFile:
     """What is known of one or several drives, on disk; memory holds the poses and a cache.
 
@@ -55,14 +67,7 @@ class MapFile:
             FormatError: The file is missing, no map, of a newer format, or damaged.
             OutputError: It is to be changed, and another program uses it or it cannot be written.
         """
-        path = Path(path)
-        file = path / MAP_FILE if path.is_dir() else path
-        if path.is_dir() and not file.is_file():
-            expected = f"a {MAP_FILE}, as recon map, live and merge keep it"
-            raise FormatError("folder has no map", where=path, expected=expected)
-        if path.is_dir():
-            refuse_links(path)
-        store = Store.open(file, read_only=read_only, cache_bytes=cache_bytes)
+        store = Store.open(file_of_map(path), read_only=read_only, cache_bytes=cache_bytes)
         try:
             return cls(store)
         except BaseException:

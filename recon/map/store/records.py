@@ -37,6 +37,7 @@ _PIECE_BYTES: Final = 1 << 18
 _SMALL_BYTES: Final = 1 << 24
 _MOST_GROWTH: Final = 16
 """What was measured becomes two to three times smaller; small records may shrink further."""
+_LONGEST: Final = 120  # characters of what SQLite says of a damaged file
 _ROOM: Final = "check that the folder is writable and the disk is not full"
 
 
@@ -160,6 +161,11 @@ class _Content:
             self.read(min(_PIECE_BYTES, self.left))
         self._file.close()
 
+    def check(self, checksum: int, of: str) -> None:
+        """Refuse content whose bytes, all read, have another checksum."""
+        if self.checksum != checksum:
+            raise FormatError("a record of the map is damaged", got=of)
+
 
 class Store:
     """Records under a kind and a key, in one SQLite file.
@@ -253,8 +259,7 @@ class Store:
                 raise
             finally:
                 content.close()
-                if content.checksum != checksum:
-                    raise FormatError("a record of the map is damaged", got=f"{kind} {name}")
+                content.check(checksum, f"{kind} {name}")
 
     def delete(self, kind: str, key: Key | None = None) -> None:
         """Delete a record, or all of a kind; it need not exist."""
@@ -274,6 +279,33 @@ class Store:
         """Return the second numbers of the keys of a kind that begin with that of a session."""
         keys = (key for key in self.keys(kind) if isinstance(key, tuple))
         return [key[1] for key in keys if key[0] == session]
+
+    def names(self) -> list[tuple[str, str]]:
+        """Return kind and name of every record, as they are written, damaged ones included."""
+        with self._lock, reading(self.name):
+            return self._database.execute("SELECT kind, key FROM record").fetchall()
+
+    def verify(self, kind: str, name: str) -> int:
+        """Read a record of `names` piece by piece against its checksum; returns its bytes."""
+        with self._lock, reading(self.name):
+            text, content, checksum = self._row(kind, name)
+            size = len(text) + content.left
+            content.close()
+            content.check(checksum, f"{kind} {name}")
+            _key(name)
+            return size
+
+    def verify_pages(self) -> None:
+        """Refuse a file whose pages do not fit together, whatever the records say."""
+        with self._lock, reading(self.name):
+            (found,) = self._database.execute("PRAGMA integrity_check(1)").fetchone()
+            if found != "ok":
+                raise FormatError("the file of the map is damaged", got=str(found)[:_LONGEST])
+
+    @property
+    def format(self) -> int:
+        """Number of the format that the file was written in."""
+        return int(self._database.execute("PRAGMA user_version").fetchone()[0])
 
     def kinds(self) -> list[str]:
         with self._lock, reading(self.name):
@@ -303,8 +335,7 @@ class Store:
                 text, content, checksum = self._row(kind, _name(key))
                 whole = content.read(content.left)
                 content.close()
-                if content.checksum != checksum:
-                    raise FormatError("a record of the map is damaged", got=f"{kind} {_name(key)}")
+                content.check(checksum, f"{kind} {_name(key)}")
             other._insert(kind, _name(new), text, [whole])
 
     def commit(self) -> None:

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import platform
+import re
 import shlex
 import shutil
 import signal
@@ -39,7 +40,9 @@ _TAIL_BYTES: Final = 1 << 16  # at the end of a log, in which the last try is fo
 _PROGRAM: Final = (sys.executable, "-m", "recon.run.batch.guard")
 _LOOK_S: Final = 0.2
 _OTHERS_S: Final = 90.0
-_LOG_S: Final = 10.0  # the log of a job has so many seconds between two of its frames
+_STARTED: Final = re.compile(rb'\{"event": "start".*"(\w+)": (\d+)\}')
+_PROGRESS: Final = b"progress: "
+LOG_S: Final = 10.0  # the log of a job has so many seconds between two of its frames
 _LEAST_FREE_BYTES: Final = 32_000_000
 _INPUT: Final = (1, 2)  # exit codes of bad input and of wrong usage
 _LONGEST: Final = 400
@@ -113,6 +116,22 @@ def last_outcome(folder: Path, name: str) -> Outcome:
         return replace(last, state="succeeded", error="")
     gone = last.state == "succeeded"
     return replace(last, state="broken", error="its result is gone") if gone else last
+
+
+def progress_of(folder: Path, name: str) -> str:
+    """Return what a job does that runs, by the end of its log: ``map, frames 120/400, 7.9/s``."""
+    stage = done = ""
+    with suppress(OSError), log_file(folder, name).open("rb") as file:
+        file.seek(-min(_TAIL_BYTES, os.fstat(file.fileno()).st_size), os.SEEK_END)
+        for line in file:
+            if line.startswith((b'{"try": ', b'{"event": "stage"')):
+                with suppress(json.JSONDecodeError):
+                    stage, done = json.loads(line).get("name", ""), ""
+            elif line.startswith((b'{"event": "start"', b'{"event": "finish"')):
+                done = ""
+            elif line.startswith(_PROGRESS):
+                done = line[len(_PROGRESS) :].decode(errors="replace").strip()
+    return ", ".join(filter(None, (stage, done)))
 
 
 def is_done(out: Path) -> bool:
@@ -220,14 +239,20 @@ def _run(
 
 def _listen(stream: IO[bytes], log: IO[bytes], said: list[str]) -> None:
     """Keep what a process says in its log; ``said`` gets the line in which it says why it ended."""
-    shown_s = -math.inf
+    shown_s, begun_s, done, total, unit = -math.inf, 0.0, 0, b"?", b"frames"
     for line in stream:
-        if line.startswith((b'{"event": "frame"', b'{"event": "scene"')):
-            if time.monotonic() < shown_s + _LOG_S:
+        how_far = b""
+        if started := _STARTED.match(line):
+            begun_s, done, unit, total = time.monotonic(), 0, *started.groups()
+        elif line.startswith((b'{"event": "frame"', b'{"event": "scene"')):
+            done, now_s = done + 1, time.monotonic()
+            if now_s < shown_s + LOG_S:
                 continue
-            shown_s = time.monotonic()
+            shown_s = now_s
+            rate = b", %.1f/s" % (done / (now_s - begun_s)) if done > 1 else b""
+            how_far = _PROGRESS + b"%b %d/%b%b\n" % (unit, done, total, rate)
         with suppress(OSError, ValueError):  # a full disk; a log that was closed
-            log.write(line)
+            log.write(line + how_far)
         text = line.decode("utf-8", "replace").strip().strip("│ ")  # a box around it
         is_plain = any(map(str.isalnum, text)) and not text.startswith("{")
         if text.startswith("error: ") or (is_plain and not said[0].startswith("error: ")):

@@ -25,7 +25,7 @@ _PLAN_BYTES: Final = 1 << 28
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.=+-]{0,119}")
 _FILES: Final = frozenset(
     (PLAN, LOGS, "run.json", "summary.json", "config.yaml", "report.html", "table.csv", "table.md",
-     "table.tex", "sweep.png")
+     "table.tex", "sweep.png", "time.png")
 )  # fmt: skip
 """What a batch writes beside the folders of its jobs."""
 _MOST_JOBS: Final = 1_000_000

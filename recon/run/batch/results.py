@@ -6,23 +6,26 @@ import json
 import math
 import os
 import statistics
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from contextvars import copy_context
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from recon.core.errors import FormatError
+from recon.core.errors import FormatError, SettingsError
 from recon.core.progress import series, stage
 from recon.core.renamed import without_former_keys
 from recon.core.summary import Figures, inline, optional
 from recon.io.atomic import is_locked
-from recon.io.files import read_text, reading
+from recon.io.files import read_text, reading, resolved
 from recon.run.batch.cluster import BatchOptions, Cluster
-from recon.run.batch.job import Job, Outcome, last_outcome, log_file
+from recon.run.batch.job import LOG_S, Job, Outcome, is_done, last_outcome, log_file, progress_of
 from recon.run.batch.job_file import PLAN
-from recon.run.directory import lock_file
+from recon.run.directory import RECORD, RECORD_BYTES, STARTED, lock_file
 from recon.run.run import SUMMARY
 
 ACCURACY: Final = (
@@ -38,6 +41,7 @@ _LEAST_SPREAD: Final = {
 from drive to drive; negative where less is worse."""
 _DRIFT: Final = ("trajectory.t_rel_percent", "t_rel_percent", "expected_drift_percent")
 """What the drift of a job is: the first of these that it has."""
+RUNS: Final = "runs"  # the command of what was run before, in a table of it
 _SUMMARY_BYTES: Final = 1 << 26
 _LEAST_JOBS: Final = 4  # fewer of one kind have no usual value
 #: The spread of a normal distribution from its median absolute deviation.
@@ -62,7 +66,9 @@ class JobFacts(Figures):
     bytes: int  # of all files in its folder
     error: str | None = optional()  # why it failed
     swept: Mapping[str, Any] | None = optional()  # its settings of a sweep
-    remark: str | None = optional()  # what is unusual about it
+    remark: str | None = optional()  # what is unusual about it, and what it was warned of first
+    progress: str | None = optional()  # what it does, while it runs
+    date: str | None = optional()  # of its drive, the newest of several; UTC
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +93,8 @@ class JobResult:
     warnings: tuple[str, ...] = ()
     remark: str = ""
     bytes: int = 0  # of all files in its folder, also where it did not succeed
+    progress: str = ""
+    date: str = ""
 
     @property
     def ok(self) -> bool:
@@ -125,6 +133,8 @@ class JobResult:
             error=last.error if self.failed else None,
             swept=dict(job.swept) or None,
             remark=self.remark or None,
+            progress=self.progress or None,
+            date=self.date or None,
         )
 
     @property
@@ -139,31 +149,87 @@ def work_off(
     """Run jobs on workers and show how many are done; yields the result of each that ends."""
     log_file(folder, "").parent.mkdir(parents=True, exist_ok=True)
     stage(f"{len(cluster.workers)} workers, dashboard {cluster.dashboard}")
-    with series(folder.name, len(jobs), unit) as shown:
+    with series(folder.name, len(jobs), unit) as shown, _told(jobs, folder):
         for job, outcome in cluster.run(jobs, folder):
             result = result_of(job, outcome, folder)
             shown.on_step(result)
             yield result
 
 
+@contextmanager
+def _told(jobs: Sequence[Job], folder: Path) -> Iterator[None]:
+    """Say now and then what jobs are doing."""
+    ended = threading.Event()
+
+    def tell() -> None:
+        while not ended.wait(LOG_S):
+            seen = ((job.name, progress_of(folder, job.name)) for job in jobs)
+            if said := "; ".join(f"{name}: {doing}" for name, doing in seen if doing):
+                stage(said)
+
+    thread = threading.Thread(target=copy_context().run, args=(tell,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
     """Return the result of a job, with the figures of its summary."""
-    size = 0
-    for place, _, names in os.walk(folder / job.name):
+    size, out = 0, Path(os.path.normpath(folder / job.name))
+    for place, _, names in os.walk(out):
         for name in names:
             with suppress(OSError):  # others may be writing or removing them
                 size += Path(place, name).lstat().st_size
     if outcome.state != "succeeded":
         return JobResult(job, outcome, bytes=size)
-    path = folder / job.name / SUMMARY
+    path = out / SUMMARY
     with reading(path):
         summary = json.loads(read_text(path, _SUMMARY_BYTES))
         if not outcome.seconds:  # its worker died before it could say so
             outcome = replace(outcome, seconds=float(summary.get("seconds", 0.0)))
         warnings = tuple(map(str, summary.get("warnings", ())))
         remark = next(iter(warnings), "")
-        figures = dict(_flat(without_former_keys(summary)))
-        return JobResult(job, outcome, figures, warnings, remark, size)
+        figures = {**dict(_flat(without_former_keys(summary))), "warnings": len(warnings)}
+        map_ = out / "map" / STARTED
+        if (length_m := figures.get("path_length_m")) and map_.is_file():
+            figures.setdefault("map_mb_per_km", map_.stat().st_size / 1e3 / length_m)
+        dates = (summary, *summary.get("sessions", ()))
+        date = max(_date(one.get("date")) for one in dates)
+        return JobResult(job, outcome, figures, warnings, remark, size, date=date)
+
+
+def _date(text: Any) -> str:
+    """Return a date and time as it is written, to the second; "" = it is none."""
+    with suppress(ValueError, TypeError):
+        datetime.fromisoformat(text[:19])
+        return str(text[:19])
+    return ""
+
+
+def runs_by_date(paths: Iterable[Path], folder: Path) -> list[JobResult]:
+    """Return finished runs, and those of batches, as jobs that lie beside a folder.
+
+    They are in the order of the dates of their drives; of when they were mapped where these are not
+    known.
+    """
+    found = []
+    for path in dict.fromkeys(map(resolved, paths)):
+        jobs = sorted(one.parent for one in path.glob(f"*/{RECORD}"))
+        for run in jobs if (path / PLAN).is_file() else [path]:
+            if not is_done(run):
+                raise FormatError("not a finished run", where=run, expected=f"a {SUMMARY}")
+            job = Job(os.path.relpath(run, folder), RUNS, str(run), (), writes=True, folder=".")
+            one = result_of(job, Outcome("succeeded", tries=1), folder)
+            with reading(run / RECORD):
+                mapped = json.loads(read_text(run / RECORD, RECORD_BYTES)).get("finished_utc", "")
+            mapped = _date(mapped) and f"{_date(mapped)} (mapped)"
+            found.append(replace(one, date=one.date or mapped))
+    if not found:
+        raise SettingsError("there is no run", where="--table", expected="folders of finished runs")
+    return sorted(found, key=lambda one: one.date)
 
 
 def compare(results: Sequence[JobResult]) -> list[JobResult]:
@@ -176,8 +242,11 @@ def compare(results: Sequence[JobResult]) -> list[JobResult]:
     for one in results:
         key = json.dumps([one.job.command, dict(one.job.swept)], sort_keys=True, default=str)
         groups.setdefault(key, []).append(one)
-    remarks = dict(found for group in groups.values() for found in _remarks(group))
-    return [replace(one, remark=remarks.get(one.job.name, one.remark)) for one in results]
+    unusual = dict(found for group in groups.values() for found in _remarks(group))
+    return [
+        replace(one, remark="; ".join(filter(None, (unusual.get(one.job.name), one.remark))))
+        for one in results
+    ]
 
 
 def wrong_first(results: Iterable[JobResult]) -> list[JobResult]:
@@ -257,6 +326,8 @@ def _seen(job: Job, folder: Path, *, running: bool) -> JobResult:
         # A try that has not ended is written as one that broke.
         if running and last.state == "broken" and not last.seconds:
             last = replace(last, state="running", error="")
+            doing = progress_of(folder, job.name)
+            return replace(result_of(job, last, folder), progress=doing)
         return result_of(job, last, folder)
     except FormatError:
         return JobResult(job, last)

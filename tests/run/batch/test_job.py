@@ -26,11 +26,12 @@ def test_a_job_writes_its_folder_and_a_log_and_is_not_run_again(tmp_path):
     assert (outcome.state, outcome.error) == ("succeeded", "")
     assert (outcome.worker, outcome.tries, outcome.seconds > 0) == ("here", 1, True)
     assert is_done(tmp_path / "a")
-    begun, command, started, frame, ended = log_of(tmp_path, "a")
+    begun, command, started, frame, how_far, ended = log_of(tmp_path, "a")
     assert '"its worker died"' in begun
     assert command == f"recon map good --out {tmp_path / 'a'}"
     assert ("start" in started, "frame" in frame) == (True, True)
     assert '"succeeded"' in ended
+    assert how_far == "progress: frames 1/2"
     assert run_job(job("a"), tmp_path, "there") == outcome
     assert tries(tmp_path, "a") == ["begun"]
     # But few of many frames.

@@ -22,7 +22,7 @@ def test_only_finite_numbers_of_a_summary_are_figures(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "summary.json").write_text(TEXT)
     found = result_of(job("a"), replace(DONE, seconds=0.0), tmp_path)
-    assert found.figures == {"a": 1, "b.c": 2.5, "seconds": 4}
+    assert found.figures == {"a": 1, "b.c": 2.5, "seconds": 4, "warnings": 1}
     assert (found.seconds, found.warnings) == (4.0, ("dark",))
     assert found.remark == "dark"  # a job that succeeded, and yet is not to be used as it is
     assert [one.remark for one in compare([found])] == ["dark"]

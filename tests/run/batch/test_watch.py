@@ -56,7 +56,7 @@ def test_a_job_is_seen_to_run_and_to_end_with_its_figures_and_size(folder, lock)
     say(folder, "a", Outcome("succeeded", seconds=2.0, tries=1), points=7, warnings=[])
     say(folder, "b", BEGUN, Outcome("failed", "no images", 1.0, tries=1))
     first, second, _ = next(rounds)
-    assert (first.figures, first.seconds, first.bytes) == ({"points": 7}, 2.0, 31)
+    assert (first.figures, first.seconds, first.bytes) == ({"points": 7, "warnings": 0}, 2.0, 31)
     assert (second.failed, second.last.error) == (True, "no images")
     say(folder, "c", BEGUN)
     assert states(next(rounds))["c"] == "running"
