@@ -24,7 +24,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import checkout  # noqa: F401 - what is measured
 import numpy as np
@@ -40,6 +40,8 @@ from recon.export.product import ExportContext
 from recon.io.images.image import write_image
 from recon.io.trajectory import read_tum, write_kitti_poses
 from recon.map.map import Map
+from recon.map.sessions.copying import copy_sessions
+from recon.map.sessions.joining import join_new
 from recon.map.sessions.placed import place_map
 from recon.map.store.map_file import MAP_FILE
 from recon.report import style
@@ -48,7 +50,9 @@ from tests.scenery.year import WEEKS, WeekDrive
 NEAR_M: Final = 0.03
 LOOKED: Final = (1, 2, 4, 8, 13, 20, 26, 33, 39, 45, 51)
 """Weeks, from 0, whose drive is looked for in the weeks before, and at which maps are compared."""
-KEPT: Final = {"looked after": "into", "all kept": "all", "newest only": "alone"}
+KEPT: Final = {"looked after": "into", "all kept": "all", "newest only": "newest"}
+JOINING: Final = ("links", "tend", "map", "cloud", "octomap", "grid")
+"""What takes longer in a larger map, by its names in the summary."""
 PRODUCTS: Final = ("cloud", "octomap", "grid")
 
 
@@ -83,51 +87,47 @@ class Year:
         self.folder = folder
         for name in (*KEPT.values(), "found", "products"):
             shutil.rmtree(folder / name, ignore_errors=True)
+        self.files = {name: folder / each / MAP_FILE for name, each in KEPT.items()}
+        for file in self.files.values():
+            file.parent.mkdir(parents=True) if "into" not in file.parts else None
         self.rows: dict[str, dict[int, dict[str, float]]] = {name: {} for name in KEPT}
 
     def add(self, week: int) -> None:
         """Look for the drive of a week in the maps so far, then put it into them."""
         drive = write_drive(week, self.folder / "drives" / f"{week:02d}")
-        into, alone, all_ = (self.folder / name for name in ("into", "alone", "all"))
-        before = {
-            "looked after": into,
-            "all kept": all_ / MAP_FILE,
-            "newest only": alone / f"{week - 1:02d}",
-        }
-        for name, map_ in before.items() if week in LOOKED else ():
-            self._row(name, week - 1).update(self._found(drive, map_, name))
-        seconds = run("map", drive, "--no-mesh", "--out", alone / f"{week:02d}")
-        self._row("newest only", week).update(
-            seconds=seconds, megabytes=size(alone / f"{week:02d}")
-        )
-        if week:
-            seconds = run("map", drive, "--into", into, "--no-mesh")
-        else:
-            run("map", drive, "--no-mesh", "--out", into)
-        self._row("looked after", week).update(seconds=seconds, megabytes=size(into))
-        self._keep_all(alone / f"{week:02d}", all_, seconds, week)
+        for name, file in self.files.items() if week in LOOKED else ():
+            self._row(name, week - 1).update(self._found(drive, file, name))
+        into = self.folder / KEPT["looked after"]
+        words = ("map", drive, "--no-mesh", "--into" if week else "--out", into)
+        seconds, summary = run(*words)
+        self._row("looked after", week).update(seconds=seconds, megabytes=size(into / MAP_FILE))
+        mapped_s = seconds - sum(summary["stages"].get(name, 0.0) for name in JOINING)
+        with Map.open(into) as map_:
+            before = [one.number for one in map_.sessions[:-1]]
+            file = self.files["newest only"]
+            with Map.create(file) as alone:
+                copy_sessions(map_, alone, before)
+                alone.commit()
+            self._row("newest only", week)["megabytes"] = size(file)
+            self._keep_all(map_, before, mapped_s, week)
 
     def _row(self, name: str, week: int) -> dict[str, float]:
         return self.rows[name].setdefault(week, {})
 
-    def _keep_all(self, new: Path, kept: Path, alone_s: float, week: int) -> None:
+    def _keep_all(self, newest: Map, before: list[int], mapped_s: float, week: int) -> None:
         """Merge a drive; its products are made where maps are compared, as they take long."""
-        file, begun, row = kept / MAP_FILE, time.perf_counter(), self._row("all kept", week)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with Map.create(file) if not week else Map.open(file, read_only=False) as map_:
-            with Map.open(new) as drive:
-                map_.merge(drive)
+        file, row, begun = self.files["all kept"], self._row("all kept", week), time.perf_counter()
+        with Map.open(file, read_only=False) if week else Map.create(file) as map_:
+            join_new(map_, copy_sessions(newest, map_, before))
             map_.commit()
-            row["megabytes"] = file.stat().st_size / 1e6
+            row["megabytes"] = size(file)
             if week + 1 in LOOKED or week + 1 == WEEKS:
-                settings, out = run_settings(new), self.folder / "products"
+                config = run_settings(self.folder / KEPT["looked after"])
+                placed = place_map(map_, config, 2)
+                out = self.folder / "products"
                 out.mkdir(exist_ok=True)
-                context = ExportContext(
-                    map_, place_map(map_, settings, 2), settings.mesh, threads=2
-                )
-                make(context, out, PRODUCTS)
-                # What it takes to map the drive, too, which was done by another command.
-                row["seconds"] = alone_s + time.perf_counter() - begun
+                make(ExportContext(map_, placed, config.mesh, threads=2), out, PRODUCTS)
+                row["seconds"] = mapped_s + time.perf_counter() - begun
 
     def _found(self, drive: Path, map_: Path, name: str) -> dict[str, float]:
         """Look for a drive in a map; what part of its frames is found, and how precisely."""
@@ -178,18 +178,18 @@ def true_path(drive: Path) -> Float64:
     return np.asarray(np.load(drive / "T_street_first.npy") @ poses)
 
 
-def run(command: str, *words: object) -> float:
-    """Run a command, and return the seconds that it took."""
+def run(command: str, *words: object) -> tuple[float, dict[str, Any]]:
+    """Run a command; return the seconds that it took, and its summary."""
     line = [sys.executable, "-m", "recon", command, *map(str, words), "--json", "--quiet"]
     begun = time.perf_counter()
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     if done.returncode:
         sys.exit(f"recon {command} ended with {done.returncode}: {done.stderr.strip()}")
-    return time.perf_counter() - begun
+    return time.perf_counter() - begun, json.loads(done.stdout)
 
 
-def size(folder: Path) -> float:
-    return (folder / MAP_FILE).stat().st_size / 1e6
+def size(file: Path) -> float:
+    return file.stat().st_size / 1e6
 
 
 @style.styled
