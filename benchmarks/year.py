@@ -3,7 +3,7 @@
 The drives are rendered (`tests/scenery/year.py`): cars, a hoarding, a tree, leaves, sun and rain.
 Each goes into one map as `recon map DRIVE --into RUN` puts it there. Beside it a map that keeps all
 drives, and the newest drive alone. Before some weeks go in, their drive is looked for in the maps
-of the weeks before. A frame is found if the map confirms its pose and it is within 3 cm of the
+of the weeks before. A frame is found if the map gives its pose and it is within 3 cm of the
 truth; the truth is fitted to the paths that the map has, not to what is found.
 
 Drives, runs and curves stay in --folder; drives that are there already are not rendered again.
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         year = Year(folder)
         for week in track(range(options.weeks), "weeks", disable=options.json):
             year.add(week)
-        found = year.rows | {"minutes": (time.perf_counter() - begun) / 60.0}
+        found = {"maps": year.rows, "minutes": (time.perf_counter() - begun) / 60.0}
         (folder / "year.png").write_bytes(curves(year.rows))
     if options.json:
         print(json.dumps(found, indent=2))
