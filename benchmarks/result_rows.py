@@ -342,6 +342,23 @@ def recordings(found: Found) -> Rows:
     return rows
 
 
+def year(found: Found) -> Rows:
+    """What a map costs and finds at the begin and the end of a year, by what it keeps."""
+    rows: Rows = {}
+    for name, weeks in found["year"]["maps"].items():
+        last = max(weeks, key=int)
+        before = weeks.get(str(int(last) - 1), {})
+        rows[name] = {
+            "map after week 1": weeks["0"]["megabytes"],
+            "after week 52": weeks[last]["megabytes"],
+            "week 2 added in": weeks["1"].get("seconds"),
+            "week 52 in": weeks[last].get("seconds"),
+            "week 52 found at 3 cm": before.get("found_percent"),
+            "off": None if "off_m" not in before else 100 * before["off_m"],
+        }
+    return rows
+
+
 def surfaces(found: Found) -> Rows:
     """How much of what is seen at a depth a map has, and how much of it is right."""
     return {

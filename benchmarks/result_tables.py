@@ -322,6 +322,13 @@ TABLES: Final[dict[str, Table]] = {
         | dict.fromkeys(("ORB-SLAM3", "COLMAP"), "{}"),
         rows_of.recordings,
     ),
+    "year": Table(
+        {"year": "python benchmarks/year.py --json"},
+        {"map after week 1": "{:.1f} MB", "after week 52": "{:.1f} MB"}
+        | {"week 2 added in": "{:.0f} s", "week 52 in": "{:.0f} s"}
+        | {"week 52 found at 3 cm": "{:.0f} %", "off": CM},
+        rows_of.year,
+    ),
     "surfaces": Table(
         {
             "as it comes": "python benchmarks/surfaces.py $RECON_DATA/rendered/yard --json",
