@@ -113,8 +113,9 @@ def batch_table(all_jobs: Sequence[JobSummary]) -> Table:
     from recon.run.batch.results import accuracies
 
     table, jobs = Table(show_edge=False, pad_edge=False), all_jobs[:_MOST_JOBS]
+    warned = ["warnings"] if any(job.warnings for job in jobs) else []
     judged = accuracies(job.figures for job in jobs)
-    for title in ("job", "state", "tries", "s", "MB", *judged, "warnings"):
+    for title in ("job", "state", "tries", "s", "MB", *judged, *warned):
         table.add_column(re.sub(r"(?<=[a-z])[._]", " ", title), overflow="fold")
     for job in jobs:
         facts = job.facts
@@ -122,7 +123,8 @@ def batch_table(all_jobs: Sequence[JobSummary]) -> Table:
         state = ": ".join(filter(None, (facts.state, facts.progress)))
         figures = (job.figures.get(name) for name in judged)
         found = ("" if value is None else f"{value:.4g}" for value in figures)
-        table.add_row(*map(Text, (facts.name, state, *times, *found, str(len(job.warnings)))))
+        many = [str(len(job.warnings)) for _ in warned]
+        table.add_row(*map(Text, (facts.name, state, *times, *found, *many)))
     return table
 
 
