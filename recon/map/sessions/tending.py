@@ -76,7 +76,8 @@ def tend(map_: MapFile, settings: DriveSettings, keep: Keep) -> str:
         forget(map_, leaving)
     parts = [f"{len(leaving)} of {counted(before, 'drive')}"] if leaving else []
     parts += [f"{100 * (1 - left / rays):.0f} % of the rays"] if left < rays else []
-    return ", ".join(parts)
+    seen_again = parts and keep.days is None and keep.region is None
+    return ", ".join(parts) + (": newer drives saw the same" if seen_again else "")
 
 
 def forget(map_: MapFile, numbers: Collection[int]) -> None:
