@@ -219,7 +219,7 @@ class JoinedSummary(RunSummary):
             (f"map of {linked}{apart} {'drive' if drives == 1 else 'drives'}, {path}",),
             *self.folder_row(),
             *self.made.rows(),
-            *([("forgot", f"{self.tended}: newer drives saw the same")] if self.tended else []),
+            *([("forgot", self.tended)] if self.tended else []),
             # Eight lines: what was forgotten is news.
             *([("links" if drives > 1 else "survey", held)] if held and not full else []),
             *self.cost_row(),

@@ -72,10 +72,12 @@ def tend(map_: MapFile, settings: DriveSettings, keep: Keep) -> str:
         voxels = sum(entry.voxels for entry in session.submaps.entries)
         if not (thinned.rays or thinned.keyframes or voxels or session is map_.first):
             leaving.add(number)
-    forget(map_, leaving)
+    if leaving:
+        forget(map_, leaving)
     parts = [f"{len(leaving)} of {counted(before, 'drive')}"] if leaving else []
     parts += [f"{100 * (1 - left / rays):.0f} % of the rays"] if left < rays else []
-    return ", ".join(parts)
+    seen_again = parts and keep.days is None and keep.region is None
+    return ", ".join(parts) + (": newer drives saw the same" if seen_again else "")
 
 
 def forget(map_: MapFile, numbers: Collection[int]) -> None:

@@ -83,7 +83,8 @@ def test_what_newer_drives_confirm_goes_and_what_only_the_first_saw_stays():
     for number in (2, 3):  # the newest two are whole
         assert after[number] == before[number][1:]
     had, left = sum(row[1] for row in before), sum(rays for rays, _ in after.values())
-    assert tended == f"1 of 4 drives, {100 * (1 - left / had):.0f} % of the rays"
+    share = f"{100 * (1 - left / had):.0f} % of the rays"
+    assert tended == f"1 of 4 drives, {share}: newer drives saw the same"
     for number, path in world_poses(map_).items():
         np.testing.assert_array_equal(path, paths[number])
 
@@ -154,7 +155,7 @@ def test_a_map_of_few_drives_is_untouched():
 
 def test_a_region_keeps_what_lies_in_it_alone():
     map_ = street((0.0, 12.0))
-    tend(map_, CONFIG, Keep(region=(5.0, -10.0, 20.0, 10.0)))
+    assert tend(map_, CONFIG, Keep(region=(5.0, -10.0, 20.0, 10.0))).endswith("% of the rays")
     for number in (0, 1):
         for z in (rays_z(map_, number), voxels_z(map_, number)):
             assert z.min() >= 5.0 - 1e-6
