@@ -57,7 +57,7 @@ COMMANDS = [
     ("mesh run --out mesh --set mesh.min_component_faces=1", r"mesh .*\d/\d"),
     ("occupancy run --out grid", r"grid .*\d/\d"),
     ("merge run later --out merged", r"cut into tiles .*\d/\d"),
-    ("diff run later --out changes", r"tiles .*\d/\d"),
+    ("diff run later --out changes", r"compare "),
     ("localize drive --map run --out found", r"drive .*\d/8"),
     (f"pair {SCENE} --calib scenes/square/calib.txt --out pair", r"match "),
     (f"disparity {SCENE} --out disparity", r"match "),

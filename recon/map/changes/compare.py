@@ -124,11 +124,12 @@ def _classified(
         cloud, other = own.cloud_in(around), others.cloud_in(around)
         if not len(cloud):
             continue
-        points, sigma_m = cloud.xyz.astype(np.float64), _frame_sigma_m(cloud)
+        points, frames = cloud.xyz.astype(np.float64), 1 if cloud.count is None else cloud.count
+        sigma_m = np.asarray(_sigma_m(cloud) * np.sqrt(frames), np.float32)  # in a frame
         found = np.full(len(cloud), NOT_COMPARED, np.uint8)
         if len(other):
             distance_m, row = cKDTree(other.xyz).query(points)
-            error_m = np.hypot(sigma_m, _frame_sigma_m(other)[row])
+            error_m = np.hypot(_sigma_m(cloud), _sigma_m(other)[row])
             reach_m = 2 * fusion.largest_voxel_m + FREE_MARGIN_SIGMAS * error_m
             found[distance_m <= reach_m] = SAME
         voxels, evidence = both.wide_voxels(tile.key), both.evidence(tile.key, 0)
@@ -139,8 +140,6 @@ def _classified(
         yield cloud.select(inside), found[inside]
 
 
-def _frame_sigma_m(cloud: PointCloud) -> Float32:
-    """Return float32 (N,), standard deviation of each point in a frame; 0 where it is not known."""
-    if cloud.sigma_m is None or cloud.count is None:
-        return np.zeros(len(cloud), np.float32)
-    return np.asarray(cloud.sigma_m * np.sqrt(cloud.count), np.float32)
+def _sigma_m(cloud: PointCloud) -> Float32:
+    """Return float32 (N,), standard deviation of each fused point; 0 where it is not known."""
+    return np.zeros(len(cloud), np.float32) if cloud.sigma_m is None else cloud.sigma_m
