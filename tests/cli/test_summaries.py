@@ -109,8 +109,9 @@ MAP = MapSummary(
     path_length_m=1234.5, expected_drift_percent=0.25, expected_drift_rig_percent=0.1,
     frames_not_trusted=12, focal_px=700.0, field_of_view_deg=80.0, T_map_world=np.eye(4), scale=1.0,
     voxel_m=0.1, largest_voxel_m=0.1, reach_m=18.0, reach_error_m=0.25,
-    typical_depth_m=12.5, made=MADE, rig=RigFigures(refined=True), trajectory=PATH,
-    map=SURFACE, read=SourceFigures(), **COST,
+    typical_depth_m=12.5, date="2026-11-29T12:00:00Z", date_from="stamps", map_mb_per_km=12.3,
+    made=MADE, rig=RigFigures(refined=True), trajectory=PATH, map=SURFACE,
+    read=SourceFigures(), **COST,
 )  # fmt: skip
 LIVE = SourceFigures(
     live=LiveFigures(
@@ -120,11 +121,13 @@ LIVE = SourceFigures(
 )  # fmt: skip
 JOINED = JoinedSummary(
     frames=2202, path_length_m=2345.6, links=LinkFigures(123, 1, {"0-1": 123}),
-    positions_misfit_rms_m=0.034, made=MADE, T_map_world=np.eye(4), **COST,
+    positions_misfit_rms_m=0.034, forgotten=(), map_mb_per_km=12.3, made=MADE,
+    T_map_world=np.eye(4), **COST,
     sessions=[
         JoinedDrive(
             number=n, name="06", frames=1101, length_m=1234.5, linked=n < 2, frames_not_trusted=0,
-            frames_placed=1101, positions=0, rig=None,
+            frames_placed=1101, positions=0, rig=None, date="2026-11-29T12:00:00Z",
+            date_from="stamps", rays_kept=0.5, keyframes_kept=0.5,
         )
         for n in range(3)
     ],
