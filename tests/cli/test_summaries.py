@@ -20,7 +20,6 @@ from recon.commands.map_summary import (
     MapSummary,
     UsualProducts,
 )
-from recon.core.renamed import with_former_keys
 from recon.core.summary import (
     Figures,
     RunSummary,
@@ -296,7 +295,7 @@ def test_its_json_has_no_number_that_json_has_not_and_verbose_shows_all_of_it(na
     print_summary(summary, as_json=True)
     printed = json.loads(capsys.readouterr().out)
     known = json.loads(json.dumps(summary.to_json(), allow_nan=False))
-    assert printed == with_former_keys(known)
+    assert printed == known
     print_summary(summary, verbose=True)
     shown = capsys.readouterr().out
     numbers = [key for key, value in known.items() if isinstance(value, int | float | str)]
