@@ -1,10 +1,10 @@
 """A street mapped every week of a year: size, time and recall of a map that is looked after.
 
-The drives are rendered (`tests/scenery/year.py`), 32 frames each: cars, a hoarding, a tree, leaves, sun and rain.
-Each goes into one map as `recon map DRIVE --into RUN` puts it there. Beside it a map that keeps all
-drives, and the newest drive alone. Before some weeks go in, their drive is looked for in the maps
-of the weeks before. A frame is found if the map gives its pose and it is within 3 cm of the
-truth; the truth is fitted to the paths that the map has, not to what is found.
+The drives are rendered (`tests/scenery/year.py`), 32 frames each: cars, a hoarding, a tree, leaves,
+sun and rain. Each goes into one map as `recon map DRIVE --into RUN` puts it there. Beside it a map
+that keeps all drives, and the newest drive alone. Before some weeks go in, their drive is looked
+for in the maps of the weeks before. A frame is found if the map gives its pose and it is within
+3 cm of the truth; the truth is fitted to the paths that the map has, not to what is found.
 
 Drives, runs and curves stay in --folder; drives that are there already are not rendered again.
 
