@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
 import shutil
 import subprocess
 import sys
@@ -103,7 +104,7 @@ class Year:
         words = ("map", drive, "--no-mesh", "--into" if week else "--out", into)
         seconds, summary = run(*words)
         self._row("looked after", week).update(seconds=seconds, megabytes=size(into / MAP_FILE))
-        mapped_s = seconds - sum(summary["stages"].get(name, 0.0) for name in JOINING)
+        joined = sum(summary["stages"].get(name, 0.0) for name in JOINING) / summary["seconds"]
         with Map.open(into) as map_:
             before = [one.number for one in map_.sessions[:-1]]
             file = self.files["newest only"]
@@ -111,14 +112,14 @@ class Year:
                 copy_sessions(map_, alone, before)
                 alone.commit()
             self._row("newest only", week)["megabytes"] = size(file)
-            self._keep_all(map_, before, mapped_s, week)
+            self._keep_all(map_, before, seconds * (1 - joined), week)
 
     def _row(self, name: str, week: int) -> dict[str, float]:
         return self.rows[name].setdefault(week, {})
 
     def _keep_all(self, newest: Map, before: list[int], mapped_s: float, week: int) -> None:
         """Merge a drive; its products are made where maps are compared, as they take long."""
-        file, row, begun = self.files["all kept"], self._row("all kept", week), time.perf_counter()
+        file, row, begun = self.files["all kept"], self._row("all kept", week), time.process_time()
         with Map.open(file, read_only=False) if week else Map.create(file) as map_:
             join_new(map_, copy_sessions(newest, map_, before))
             map_.commit()
@@ -129,7 +130,7 @@ class Year:
                 out = self.folder / "products"
                 out.mkdir(exist_ok=True)
                 make(ExportContext(map_, placed, config.mesh, threads=2), out, PRODUCTS)
-                row["seconds"] = mapped_s + time.perf_counter() - begun
+                row["seconds"] = mapped_s + time.process_time() - begun
 
     def _found(self, drive: Path, map_: Path, name: str) -> dict[str, float]:
         """Look for a drive in a map; what part of its frames is found, and how precisely."""
@@ -182,13 +183,19 @@ def true_path(drive: Path) -> Float64:
 
 
 def run(command: str, *words: object) -> tuple[float, dict[str, Any]]:
-    """Run a command; return the seconds that it took, and its summary."""
+    """Run a command; return the processor seconds that it took, and its summary."""
     line = [sys.executable, "-m", "recon", command, *map(str, words), "--json", "--quiet"]
-    begun = time.perf_counter()
+    begun_s = spent_s()
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     if done.returncode:
         sys.exit(f"recon {command} ended with {done.returncode}: {done.stderr.strip()}")
-    return time.perf_counter() - begun, json.loads(done.stdout)
+    return spent_s() - begun_s, json.loads(done.stdout)
+
+
+def spent_s() -> float:
+    """Processor seconds of all commands so far, which other programs change little."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def size(file: Path) -> float:
@@ -200,7 +207,7 @@ def curves(rows: dict[str, dict[int, dict[str, float]]]) -> bytes:
     """Size, time and recall over the weeks."""
     shown = {
         "megabytes": "map, MB",
-        "seconds": "seconds to add a drive",
+        "seconds": "processor seconds to add a drive",
         "found_percent": "% of the next drive found at 3 cm",
     }
     figure, panels = style.subplots(style.WIDE_IN, 3.4, 1, len(shown), squeeze=False)
