@@ -51,10 +51,10 @@ from tests.scenery.year import WEEKS, WeekDrive
 
 NEAR_M: Final = 0.03
 FRAMES: Final = 32  # of each drive
-LOOKED: Final = (1, 4, 13, 26, 39, 51)
+LOOKED: Final = (1, 4, 13, 26, 51)
 """Weeks, from 0, whose drive is looked for in the weeks before, and at which maps are compared."""
 KEPT: Final = {"looked after": "into", "all kept": "all", "newest only": "newest"}
-JOINING: Final = ("links", "tend", "map", "cloud", "octomap", "grid")
+JOINING: Final = ("links", "forget", "map", "cloud", "octomap", "grid")
 """What takes longer in a larger map, by its names in the summary."""
 PRODUCTS: Final = ("cloud", "octomap", "grid")
 
