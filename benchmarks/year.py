@@ -1,6 +1,6 @@
 """A street mapped every week of a year: size, time and recall of a map that is looked after.
 
-The drives are rendered (`tests/scenery/year.py`), 32 frames each: cars, a hoarding, a tree, leaves,
+The drives are rendered (`tests/scenery/year.py`), 20 frames each: cars, a hoarding, a tree, leaves,
 sun and rain. Each goes into one map as `recon map DRIVE --into RUN` puts it there. Beside it a map
 that keeps all drives, and the newest drive alone. Before some weeks go in, their drive is looked
 for in the maps of the weeks before. A frame is found if the map gives its pose and it is within
@@ -50,7 +50,7 @@ from recon.report import style
 from tests.scenery.year import WEEKS, WeekDrive
 
 NEAR_M: Final = 0.03
-FRAMES: Final = 32  # of each drive
+FRAMES: Final = 20  # of each drive
 LOOKED: Final = (1, 4, 13, 26, 51)
 """Weeks, from 0, whose drive is looked for in the weeks before, and at which maps are compared."""
 KEPT: Final = {"looked after": "into", "all kept": "all", "newest only": "newest"}
