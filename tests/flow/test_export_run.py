@@ -168,7 +168,7 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     words = ["--georeference", tmp_path / "gnss.txt", f"--antenna=0,0,{-height_m}"]
     out = tmp_path / "out"
     words += ["--crs", "EPSG:25832", "--out", out]
-    done = run("export", small_demo, "--to", "dsm,dtm,slope,orthophoto,occupancy", *words)
+    done = run("export", small_demo, "--to", "dsm,dtm,slope,orthophoto,grid-geotiff", *words)
     assert done.code == 0, done.err
     cloud = read_ply(small_demo / "map/cloud.ply")
     xyz = np.einsum("ij,nj->ni", R, cloud.xyz.astype(np.float64)) + origin
