@@ -4,14 +4,14 @@ A car has changed if it stands in the street in one of the two weeks only. It co
 saw 30 % of its longer side, by the true depth of every sixth frame, up to where the clouds of the
 maps end (``reach_m``); and if the other drive saw at least half of those places from within 25 m:
 `free`, if it saw farther there, or else `replaced`, such as by another car in the bay. It is found
-if the box of a thing of its kind overlaps its own; of one that was replaced, of either kind. A
-thing is false if its box overlaps nothing that changed: cars, hoarding, fence, the growing tree;
+if the box of an object of its kind overlaps its own; of one that was replaced, of either kind. A
+object is false if its box overlaps nothing that changed: cars, hoarding, fence, the growing tree;
 crowns of trees, where leaves are of another season.
 
 WEEKS has the weeks as folders (image_2, image_3, calib.txt, times.txt, T_street_first.npy), or they
 are rendered; RUNS their maps, which are made where they are missing.
 
-Of HALVES, two runs of one drive, nothing but what drives may be found; all things are counted.
+Of HALVES, two runs of one drive, nothing but what drives may be found; all objects are counted.
 
 Example: python benchmarks/changes.py RUNS --weeks WEEKS --pairs 0-1,50-51 --json
 """
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.halves is not None:
         before, after = options.halves
         found = run_diff(before, after, MapOptions("diff", options.runs / "halves"))
-        rows = [{"things": len(found.things), "not_compared": found.not_compared_ratio}]
+        rows = [{"objects": len(found.objects), "not_compared": found.not_compared_ratio}]
     else:
         pairs = [[*map(int, pair.split("-"))] for pair in options.pairs.split(",")]
         rows = [weeks(one, other, options.runs, options.weeks) for one, other in pairs]
@@ -79,7 +79,7 @@ def weeks(before: int, after: int, runs: Path, rendered: Path | None) -> dict[st
     summary = json.loads((out / "summary.json").read_text())
     first = drive(before).world.T_street_camera[0]
     boxes = [(one, street_box(one, first @ np.linalg.inv(summary["T_map_world"])))
-             for one in summary["things"]]  # fmt: skip
+             for one in summary["objects"]]  # fmt: skip
     reach_m = min(json.loads((run / "summary.json").read_text())["reach_m"] for run in both)
     cars = [
         *changed_cars(before, after, "went", reach_m),
@@ -99,7 +99,7 @@ def weeks(before: int, after: int, runs: Path, rendered: Path | None) -> dict[st
     real = [box for *_, box in cars] + [*other_changes(before, after)]
     false = [one["number"] for one, its in boxes if not any(overlap(its, box) for box in real)]
     path_m = drive(before).trajectory.path_length_m
-    return {"weeks": (before, after), "found_of": counted, "missed": missed, "things": len(boxes),
+    return {"weeks": (before, after), "found_of": counted, "missed": missed, "objects": len(boxes),
             "false": false, "false_per_100_m": round(100 * len(false) / path_m, 2),
             "seconds": summary["seconds"],
             "not_compared": summary["not_compared_ratio"]}  # fmt: skip
@@ -193,13 +193,13 @@ def box_of(vertices: np.ndarray) -> np.ndarray:
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
-def street_box(thing: dict[str, Any], T_street_map: np.ndarray) -> np.ndarray:
-    """Return the lowest and highest corner of the box of a thing, street axes."""
-    turn = math.radians(thing["heading_deg"])
+def street_box(changed: dict[str, Any], T_street_map: np.ndarray) -> np.ndarray:
+    """Return the lowest and highest corner of the box of an object, street axes."""
+    turn = math.radians(changed["heading_deg"])
     c, s = math.cos(turn), math.sin(turn)
-    half = np.array([thing["length_m"], thing["width_m"], thing["height_m"]]) / 2
+    half = np.array([changed["length_m"], changed["width_m"], changed["height_m"]]) / 2
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    corners = np.array(thing["centre_m"]) + (signs * half) @ np.array(
+    corners = np.array(changed["centre_m"]) + (signs * half) @ np.array(
         [[c, s, 0], [-s, c, 0], [0, 0, 1]]
     )
     street = corners @ T_street_map[:3, :3].T + T_street_map[:3, 3]

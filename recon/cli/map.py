@@ -296,7 +296,7 @@ def diff(
 
     Each may hold several drives. They are linked by places that both saw. Points
     of either day are the same, came, went, or could not be compared, since the
-    other day did not look there. Things are listed with place, size, volume, when
+    other day did not look there. Objects are listed with place, size, volume, when
     they were seen, and a picture of both days.
 
     Examples:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.io.atomic import write_text
-from recon.map.changes.things import Thing
+from recon.map.changes.objects import ChangedObject
 from recon.report.page import run_figures, run_section, write_page
 from recon.report.sections import Image, Page, Row, Section, Table, csv_text, known
 from recon.run.directory import RunDirectory
@@ -20,7 +20,7 @@ _CAPTION: Final = (
 )
 
 
-def _row(one: Thing) -> Row:
+def _row(one: ChangedObject) -> Row:
     volume = known("{:.2f}", one.volume_m3, "–") + known(" ± {:.2f}", one.volume_sigma_m3)
     middle = ", ".join(f"{x:.1f}" for x in one.centre_m)
     size = f"{one.length_m:.1f} × {one.width_m:.1f} × {one.height_m:.1f}"
@@ -33,13 +33,13 @@ def _row(one: Thing) -> Row:
 
 
 def write_changes_page(
-    things: Sequence[Thing], summary: Mapping[str, Any], run: RunDirectory
+    objects: Sequence[ChangedObject], summary: Mapping[str, Any], run: RunDirectory
 ) -> None:
     """Write ``report.html``: the table, and pictures of both days."""
     before, after, ratios = summary["before"], summary["after"], summary["not_compared_ratio"]
     pictures = [
         Image(f"{one.number}: {one.change}", run.path(one.picture).read_bytes(), "Before | after")
-        for one in things
+        for one in objects
         if one.picture is not None
     ]
     shown = [
@@ -47,14 +47,14 @@ def write_changes_page(
         *((f"Not compared, {day}", f"{ratio:.0%}") for day, ratio in ratios.items()),
         *run_figures(summary),
     ]
-    table = Table("What came and went", _HEAD, [*map(_row, things)], caption=_CAPTION)
+    table = Table("What came and went", _HEAD, [*map(_row, objects)], caption=_CAPTION)
     sections = [Section("Changes", [table, *pictures]), run_section(summary)]
     write_page(Page("What changed", f"{before} and {after}", shown, sections, summary), run)
 
 
-def write_things(path: Path, things: Sequence[Thing]) -> None:
-    """Write the table of things as CSV."""
-    rows = [dict(_flat(one.to_json())) for one in things]
+def write_objects(path: Path, objects: Sequence[ChangedObject]) -> None:
+    """Write the table of objects as CSV."""
+    rows = [dict(_flat(one.to_json())) for one in objects]
     write_text(path, csv_text([[*rows[0]] if rows else [], *([*row.values()] for row in rows)]))
 
 

@@ -23,7 +23,7 @@ from recon.core.errors import MappingError
 from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Float32, UInt8
 from recon.map.builders import FREE_MARGIN_SIGMAS, Submap
-from recon.map.changes.things import CAME, NOT_COMPARED, SAME, WENT, Day, Thing, things_of
+from recon.map.changes.objects import CAME, NOT_COMPARED, SAME, WENT, ChangedObject, Day, objects_of
 from recon.map.occupancy.bodies import FrameObservations
 from recon.map.occupancy.moving import find_moved
 from recon.map.sessions.copying import check_session, copy_sessions, same_drives
@@ -42,7 +42,7 @@ class Comparison:
 
     before: Day
     after: Day
-    things: Sequence[Thing]
+    objects: Sequence[ChangedObject]
 
 
 def gather(map_: MapFile, before: MapFile, after: MapFile) -> list[int]:
@@ -97,8 +97,8 @@ def compare(map_: MapFile, newer: Sequence[int], threads: int = 1) -> Comparison
         classes = np.concatenate([np.zeros(0, np.uint8), *(found for _, found in parts)])
         days.append(Day(sides[n], seen_by(sides[n]), cloud, classes))
     before, after = days
-    found = [*things_of(before, after, WENT), *things_of(after, before, CAME)]
-    found.sort(key=lambda thing: -thing.points)
+    found = [*objects_of(before, after, WENT), *objects_of(after, before, CAME)]
+    found.sort(key=lambda changed: -changed.points)
     return Comparison(before, after, [replace(one, number=n) for n, one in enumerate(found, 1)])
 
 

@@ -2,7 +2,7 @@
 
 Error alone changes cells anywhere, so those that changed alone say how frequent that is: with a
 frequency ``p``, chance makes ``n·(c·p)^(k-1)`` pieces of ``k`` cells from ``n`` such cells, if a
-cell can be joined in ``c`` ways (a bound of the number of lattice animals). Pieces are things from
+cell can be joined in ``c`` ways (a bound of the number of lattice animals). Pieces are objects from
 the size of which less than one in ten maps has one by chance.
 """
 
@@ -52,7 +52,7 @@ class Day:
 
 @dataclass(frozen=True)
 class Sighting(Figures):
-    """A frame that saw a thing; ``date_utc`` None = its stamp is no date."""
+    """A frame that saw an object; ``date_utc`` None = its stamp is no date."""
 
     session: int
     drive: str
@@ -62,7 +62,7 @@ class Sighting(Figures):
 
 
 @dataclass(frozen=True, eq=False)
-class Thing(Figures):
+class ChangedObject(Figures):
     """Something that came or went; its box is in map axes, turned from x to y by its heading."""
 
     number: int
@@ -83,8 +83,8 @@ class Thing(Figures):
     picture: str | None = None  # None = no image of either day could be read
 
 
-def things_of(own: Day, other: Day, kind: int) -> list[Thing]:
-    """Return the things of a day among its points of the class ``CAME`` or ``WENT``."""
+def objects_of(own: Day, other: Day, kind: int) -> list[ChangedObject]:
+    """Return the objects of a day among its points of the class ``CAME`` or ``WENT``."""
     seen, cloud = own.observations, own.cloud.select(own.classes == kind)
     cell_m = seen.settings.resolution_m
     keys, home = np.unique(_cells(cloud.xyz, cell_m), return_inverse=True)
@@ -101,7 +101,7 @@ def things_of(own: Day, other: Day, kind: int) -> list[Thing]:
     for frame, look in seen.by_frame(keys):
         hits[frame] = np.bincount(piece[look > 0], minlength=len(sizes))
     return [
-        _thing(own, other, cloud.select(piece[home] == one), hits[:, one], kind)
+        _object(own, other, cloud.select(piece[home] == one), hits[:, one], kind)
         for one in np.flatnonzero(enough & hits.any(axis=0)).tolist()
     ]
 
@@ -114,8 +114,8 @@ def least_cells(alone: int, compared: int) -> int:
     return 1 + max(1, math.ceil(math.log(_BY_CHANCE / max(alone, 1)) / math.log(joined)))
 
 
-def _thing(own: Day, other: Day, cloud: PointCloud, hits: Int64, kind: int) -> Thing:
-    """Return a thing by its points."""
+def _object(own: Day, other: Day, cloud: PointCloud, hits: Int64, kind: int) -> ChangedObject:
+    """Return an object by its points."""
     xyz, seen = cloud.xyz.astype(np.float64), np.flatnonzero(hits).tolist()
     rectangle = cv2.minAreaRect(np.ascontiguousarray(cloud.xyz[:, :2]))
     (x, y), (length, width), turn = rectangle
@@ -123,7 +123,7 @@ def _thing(own: Day, other: Day, cloud: PointCloud, hits: Int64, kind: int) -> T
         length, width, turn = width, length, turn + 90.0
     low, high = float(xyz[:, 2].min()), float(xyz[:, 2].max())
     plan = np.tile(cv2.boxPoints(rectangle), (2, 1))
-    return Thing(
+    return ChangedObject(
         0, CLASSES[kind], np.array([x, y, (low + high) / 2]), length, width, high - low,
         (turn + 90.0) % 180.0 - 90.0, *_volume(cloud, other.cloud, own.observations),
         len(cloud), _sighting(own, seen[0]), _sighting(own, seen[-1]),
