@@ -85,7 +85,7 @@ def run_diff(before: StrPath, after: StrPath, options: MapOptions | None = None)
         summary = DiffSummary(
             before=str(before),
             after=str(after),
-            counts={kind: sum(one.change == kind for one in objects) for kind in ("came", "went")},
+            counts=found.counts,
             not_compared_ratio={name: day.not_compared_ratio for name, day in days.items()},
             objects=objects,
             T_map_world=map_.first.T_map_world,

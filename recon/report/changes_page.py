@@ -47,9 +47,13 @@ def write_changes_page(
         *((f"Not compared, {day}", f"{ratio:.0%}") for day, ratio in ratios.items()),
         *run_figures(summary),
     ]
-    table = Table("What came and went", _HEAD, [*map(_row, objects)], caption=_CAPTION)
-    sections = [Section("Changes", [table, *pictures]), run_section(summary)]
+    sections = [Section("Changes", [changes_table(objects), *pictures]), run_section(summary)]
     write_page(Page("What changed", f"{before} and {after}", shown, sections, summary), run)
+
+
+def changes_table(objects: Sequence[ChangedObject]) -> Table:
+    """Return the table of what changed."""
+    return Table("What came and went", _HEAD, [*map(_row, objects)], caption=_CAPTION)
 
 
 def write_objects(path: Path, objects: Sequence[ChangedObject]) -> None:

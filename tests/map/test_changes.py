@@ -17,7 +17,7 @@ from recon.core.values import RectifiedCamera
 from recon.export.changes import write_changes
 from recon.io.models.ply import read_tables
 from recon.map.builders import ray_grain, thin_rays
-from recon.map.changes.compare import Comparison, compare, gather
+from recon.map.changes.compare import Comparison, compare, compare_newest, gather
 from recon.map.changes.objects import NOT_COMPARED, SAME, ChangedObject, least_cells
 from recon.map.drive.mapper import SubmapBuilder
 from recon.map.map import Map
@@ -137,6 +137,11 @@ class TestCompare:
         found = days([STAYS, WENT], [STAYS, WENT], off_m=0.04)
         assert not found.objects
         assert np.mean(found.after.classes == SAME) > 0.9
+
+    def test_the_newest_drive_has_others_to_be_compared_with(self):
+        with Map.temporary() as map_:
+            drive(map_, [STAYS], 0, frames=2)
+            assert compare_newest(map_) is None
 
 
 class TestFiles:

@@ -44,6 +44,10 @@ class Comparison:
     after: Day
     objects: Sequence[ChangedObject]
 
+    @property
+    def counts(self) -> dict[str, int]:
+        return {kind: sum(one.change == kind for one in self.objects) for kind in ("came", "went")}
+
 
 def gather(map_: MapFile, before: MapFile, after: MapFile) -> list[int]:
     """Put drives of two maps into an empty one and link them; return those that only ``after`` has.
@@ -100,6 +104,12 @@ def compare(map_: MapFile, newer: Sequence[int], threads: int = 1) -> Comparison
     found = [*objects_of(before, after, WENT), *objects_of(after, before, CAME)]
     found.sort(key=lambda changed: -changed.points)
     return Comparison(before, after, [replace(one, number=n) for n, one in enumerate(found, 1)])
+
+
+def compare_newest(map_: MapFile, threads: int = 1) -> Comparison | None:
+    """Compare the last of the linked drives of a map with the others; None = it is the only one."""
+    linked = map_.linked
+    return compare(map_, [linked[-1].number], threads) if len(linked) > 1 else None
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from recon.core.kernels.voxels import pack_keys
+from recon.core.progress import tracked
 from recon.core.summary import Figures, hidden
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Float64, Int64, UInt8
@@ -98,7 +99,7 @@ def objects_of(own: Day, other: Day, kind: int) -> list[ChangedObject]:
     compared = len(np.unique(_cells(own.cloud.xyz[own.classes != NOT_COMPARED], cell_m)))
     enough = sizes >= least_cells(int((sizes == 1).sum()), compared)
     hits = np.zeros((len(seen.frames), len(sizes)), np.int64)
-    for frame, look in seen.by_frame(keys):
+    for frame, look in tracked(seen.by_frame(keys), "frames", f"see what {CLASSES[kind]}"):
         hits[frame] = np.bincount(piece[look > 0], minlength=len(sizes))
     return [
         _object(own, other, cloud.select(piece[home] == one), hits[:, one], kind)
