@@ -29,7 +29,7 @@ from recon.export.product import ExportContext
 from recon.export.trajectories import export_sessions
 from recon.io.files import resolved
 from recon.look.rig import RefinedRig
-from recon.map.changes.compare import compare_newest
+from recon.map.changes.compare import compare
 from recon.map.drive.drive import session_info
 from recon.map.drive.sequence import check_map
 from recon.map.map import Map
@@ -183,7 +183,8 @@ def _make_joined(
         context = ExportContext(map_, placed, settings.mesh, threads=run.threads)
         made = make(context, run.content, options.products, run.watch)
         with run.stage("changes"):
-            changed = compare_newest(map_, run.threads) if options.changes else None
+            several = options.changes and len(map_.linked) > 1
+            changed = compare(map_, [map_.linked[-1].number], run.threads) if several else None
         summary = replace(
             _figures(map_, UsualProducts.of(made), tended),
             changes=None if changed is None else changed.counts,

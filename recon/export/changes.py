@@ -24,7 +24,6 @@ from recon.io.models.rasters import write_nav2_costs
 from recon.map.changes.compare import Comparison
 from recon.map.changes.objects import CAME, CLASSES, NOT_COMPARED, SAME, WENT, ChangedObject, Day
 from recon.map.store.map_file import MapFile
-from recon.map.store.session import Session
 
 _COLOURS: Final = np.array([[170] * 3, [30, 110, 235], [235, 120, 20], [80, 80, 60]], np.uint8)
 _VALUES: Final = {NOT_COMPARED: UNKNOWN, SAME: FREE, WENT: OCCUPIED // 2, CAME: OCCUPIED}
@@ -61,19 +60,12 @@ class Pictures:
     """
 
     def __init__(self, map_: MapFile, found: Comparison) -> None:
-        self._found, self.missing = found, dict[int, str]()
-        self._drives = {
-            session.number: drive
-            for session in map_.linked
-            if (drive := self._opened(map_, session)) is not None
-        }
-
-    def _opened(self, map_: MapFile, session: Session) -> DriveImages | None:
-        try:
-            return open_drive(map_, session)
-        except ReconError as error:
-            self.missing[session.number] = str(error)
-            return None
+        self._found, self.missing, self._drives = found, dict[int, str](), dict[int, DriveImages]()
+        for session in map_.linked:
+            try:
+                self._drives[session.number] = open_drive(map_, session)
+            except ReconError as error:  # noqa: PERF203 - few drives
+                self.missing[session.number] = str(error)
 
     def write(self, path: Callable[[str], Path]) -> list[ChangedObject]:
         """Write pictures of the largest objects, BEFORE on the left; return all objects."""

@@ -25,7 +25,7 @@ def _row(one: ChangedObject) -> Row:
     middle = ", ".join(f"{x:.1f}" for x in one.centre_m)
     size = f"{one.length_m:.1f} × {one.width_m:.1f} × {one.height_m:.1f}"
     ends = (
-        f"{end.date_utc or f'{end.time_s:.1f} s'}, frame {end.frame} of {end.drive}"
+        f"{end.date or f'{end.time_s:.1f} s'}, frame {end.frame} of {end.drive}"
         for end in (one.first_seen, one.last_seen)
     )
     picture = "below" if one.picture else "no images"
@@ -52,8 +52,9 @@ def write_changes_page(
 
 
 def changes_table(objects: Sequence[ChangedObject]) -> Table:
-    """Return the table of what changed."""
-    return Table("What came and went", _HEAD, [*map(_row, objects)], caption=_CAPTION)
+    """Return the table of what changed; a row says if nothing did."""
+    rows = [*map(_row, objects)] or [("", "nothing", *[""] * (len(_HEAD) - 2))]
+    return Table("What came and went", _HEAD, rows, caption=_CAPTION)
 
 
 def write_objects(path: Path, objects: Sequence[ChangedObject]) -> None:

@@ -183,11 +183,7 @@ def path_errors(of: TrajectoryMetrics | None) -> list[Table]:
 
 
 def write_joined_page(
-    map_: MapFile,
-    made: Products,
-    summary: Json,
-    run: RunDirectory,
-    changed: Comparison | None = None,
+    map_: MapFile, made: Products, summary: Json, run: RunDirectory, found: Comparison | None = None
 ) -> None:
     """Write ``report.html`` of a map of several drives: all paths on one grid."""
     drives, links = summary["sessions"], summary["links"]
@@ -209,7 +205,7 @@ def write_joined_page(
             Table("Sessions", [*columns], rows),
             Table("Places that two drives saw", ("drives", "places"), places, caption=note),
         ]),
-        *([] if changed is None else [Section("What changed", [changes_table(changed.objects)])]),
+        *([] if found is None else [Section("What changed", [changes_table(found.objects)])]),
         run_section(summary),
     ]  # fmt: skip
     shown = [
