@@ -27,7 +27,7 @@ class DiffSummary(RunSummary):
 
     before: str
     after: str
-    counts: Mapping[str, int]  # by ``came`` and ``went``
+    changes: Mapping[str, int]  # objects that ``came`` or ``went``
     not_compared_ratio: Mapping[str, float]  # of the surface of either day
     objects: Sequence[ChangedObject]  # the ones with most points first
     T_map_world: Float64  # (4, 4)
@@ -36,7 +36,7 @@ class DiffSummary(RunSummary):
         ratios = self.not_compared_ratio
         unseen = f"{ratios['before']:.0%} of the first, {ratios['after']:.0%} of the second"
         return [
-            (", ".join(f"{counted(n, 'object')} {name}" for name, n in self.counts.items()),),
+            (", ".join(f"{counted(n, 'object')} {name}" for name, n in self.changes.items()),),
             *self.folder_row(),
             ("cloud", "changes.ply", "by class: same, came, went, not compared"),
             ("table", "changes.csv", "place, size, volume, first and last seen"),
@@ -85,7 +85,7 @@ def run_diff(before: StrPath, after: StrPath, options: MapOptions | None = None)
         summary = DiffSummary(
             before=str(before),
             after=str(after),
-            counts=found.counts,
+            changes=found.counts,
             not_compared_ratio={name: day.not_compared_ratio for name, day in days.items()},
             objects=objects,
             T_map_world=map_.first.T_map_world,

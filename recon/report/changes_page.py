@@ -43,7 +43,7 @@ def write_changes_page(
         if one.picture is not None
     ]
     shown = [
-        *((name.capitalize(), str(count)) for name, count in summary["counts"].items()),
+        *((name.capitalize(), str(count)) for name, count in summary["changes"].items()),
         *((f"Not compared, {day}", f"{ratio:.0%}") for day, ratio in ratios.items()),
         *run_figures(summary),
     ]
