@@ -198,10 +198,8 @@ def audit(
         Path | None,
         opt.option(
             "Write the rig that features and motion show to a file: NAME.yaml is ours, NAME.yml, "
-            ".xml or .json OpenCV's, camchain.yaml kalibr's, camera_info.yaml ROS's two files. "
-            "Was --mend before 1.0.",
+            ".xml or .json OpenCV's, camchain.yaml kalibr's, camera_info.yaml ROS's two files.",
             "--repair",
-            "--mend",
         ),
     ] = None,
     out: Annotated[

@@ -17,7 +17,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Final
 
 import typer
 
@@ -50,9 +50,7 @@ def one_line_errors(*, quiet: bool = False, verbose: bool = False) -> Iterator[N
             _standard_output_kept_clean(quiet),
             watched(quiet=quiet, verbose=verbose),
         ):
-            # Of names that are others now; shown once, and not where it was raised.
-            warnings.simplefilter("ignore" if quiet else "default", FutureWarning)
-            warnings.showwarning = _show_warning
+            warnings.showwarning = lambda *_, **__: None  # of libraries: no user can act on them
             yield
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
@@ -76,11 +74,6 @@ def one_line_errors(*, quiet: bool = False, verbose: bool = False) -> Iterator[N
         _fail(f"a package that recon uses ended the program (sys.exit({ended.code!r}))")
     except Exception as error:  # noqa: BLE001 - whatever it is, it is a bug
         raise typer.Exit(report_unforeseen(error)) from None
-
-
-def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **_how: Any) -> None:
-    if issubclass(category, FutureWarning):
-        typer.echo(f"warning: {message}", err=True)
 
 
 def _check_surroundings() -> None:

@@ -78,7 +78,6 @@ def middlebury(
     with shared.one_line_errors():
         from recon.commands.config import PAIR_DEFAULTS
         from recon.commands.evaluate_middlebury import run_middlebury
-        from recon.core.renamed import with_former_keys
         from recon.report.middlebury_page import middlebury_tables
         from recon.report.sections import Table, join
 
@@ -97,7 +96,7 @@ def middlebury(
         tables = join(map(form, middlebury_tables(summary.to_json())))
     print_remarks(summary.remarks(), verbose=shared.verbose)
     if shared.json:
-        print_json(with_former_keys(summary.to_json()))
+        print_json(summary.to_json())
         return
     if latex or shared.verbose:
         typer.echo(tables)

@@ -34,9 +34,7 @@ def print_json(content: Mapping[str, Any]) -> None:
 def print_summary(summary: Summary, *, as_json: bool = False, verbose: bool = False) -> None:
     """Print what a command found, in a few lines, and warnings apart; ``verbose``: all figures."""
     if as_json:
-        from recon.core.renamed import with_former_keys
-
-        print_json(with_former_keys(summary.to_json()))
+        print_json(summary.to_json())
         return
     print_remarks(summary.remarks(), verbose=verbose)
     if verbose:

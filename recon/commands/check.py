@@ -45,7 +45,8 @@ class MapContent(Summary):
         if self.damaged:
             return []
         sizes, more = sum(map(Counter, self.bytes.values()), Counter()), len(self.sessions) - _SHOWN
-        many = counted(len(self.sessions), "session"), counted(_total(self.records), "record")
+        records = sum(sum(each.values()) for each in self.records.values())
+        many = counted(len(self.sessions), "session"), counted(records, "record")
         by = ", ".join(sorted({one.get("recon", "?") for one in self.versions.values()}))
         return [
             (f"{', '.join(many)}, {_mb(sum(sizes.values()))} MB, all can be read",),
@@ -58,16 +59,10 @@ class MapContent(Summary):
         ]
 
     def _row(self, one: JoinedDrive) -> tuple[str, ...]:
-        frames, keyframes = (
-            counted(one.frames, "frame"),
-            counted(self.records[f"{one.number}"].get("keyframe", 0), "keyframe"),
-        )
-        size = f"{one.length_m:.0f} m, {_mb(sum(self.bytes[f'{one.number}'].values()))} MB"
-        return (
-            f"session {one.number}",
-            one.name,
-            f"{frames}, {keyframes}, {size}",
-        )
+        number = f"{one.number}"
+        keyframes = counted(self.records[number].get("keyframe", 0), "keyframe")
+        size = f"{one.length_m:.0f} m, {_mb(sum(self.bytes[number].values()))} MB"
+        return f"session {number}", one.name, f"{counted(one.frames, 'frame')}, {keyframes}, {size}"
 
     def refuse_damage(self) -> None:
         """Raise `FormatError` for the first record that cannot be read, if there is one."""
@@ -125,10 +120,6 @@ def _noting(damaged: dict[str, str], record: str) -> Iterator[None]:
         yield
     except ReconError as error:
         damaged[record] = f"{error.what}{f': {error.got}' if record == _FILE else ''}"
-
-
-def _total(numbers: Mapping[str, Mapping[str, int]]) -> int:
-    return sum(sum(each.values()) for each in numbers.values())
 
 
 def _mb(size: int) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import json
 import re
-import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -20,7 +19,6 @@ from pydantic.fields import FieldInfo
 from typing_extensions import Self
 
 from recon.core.errors import FormatError, SettingsError
-from recon.core.renamed import current_names
 from recon.core.settings import (
     Settings,
     alternatives,
@@ -29,7 +27,6 @@ from recon.core.settings import (
     merge,
     suggest_names,
 )
-from recon.core.text import counted
 from recon.export.mesh.poisson import OVERLAP_M, MeshSettings
 from recon.io.fields import parse_yaml
 from recon.io.files import SMALL_FILE_BYTES, StrPath, read_text
@@ -149,10 +146,10 @@ def load_config(
     Raises:
         SettingsError: The file cannot be read, a key is unknown, or a value is out of range.
     """
-    own, notes = current_names(_nested(_values_of(path)))
+    own = _nested(_values_of(path))
     named = own.get("preset") if preset is None else preset
     chosen = {} if named is None else {"preset": named}
-    usual = merge(current_names(_nested(defaults or {}))[0], preset_values(named))
+    usual = merge(_nested(defaults or {}), preset_values(named))
     given = merge(merge(usual, own), chosen)
     changes: dict[str, Any] = {}
     for one in [overrides] if isinstance(overrides, str | Mapping) else overrides:
@@ -163,15 +160,8 @@ def load_config(
                 hint = "--preset NAME, or recon.load_config(preset=NAME)"
                 raise SettingsError("a preset is not one of the settings", got=part, hint=hint)
             changes = merge(changes, nested)
-    changed, old = current_names(changes, given)
-    values, notes = merge(given, changed), [*notes, *old]
-    if notes:
-        first, *more = sorted(dict.fromkeys(notes), key=lambda note: " is used" not in note)
-        shown = "; ".join([first, *more[:2]])
-        rest = f"; and {counted(len(more) - 2, 'more name')} from before 1.0" if more[2:] else ""
-        warnings.warn(shown + rest, FutureWarning, stacklevel=2)
     try:
-        return ReconConfig.parse(values)
+        return ReconConfig.parse(merge(given, changes))
     except SettingsError:
         if isinstance(path, str | PathLike):
             ReconConfig.parse(given, where=str(path))  # blames the file if it is invalid by itself

@@ -243,7 +243,7 @@ def _read_started(folder: Path) -> dict[str, Any]:
     if not started:
         what, hint = "a drive that arrived live cannot be resumed", f"its map so far is {path}"
         raise OutputError(what, where=folder, hint=hint)
-    # As in this version: settings that are fixed by now are left out.
+    # As in this version: settings that are new have their defaults.
     config = ReconConfig.parse(started["identity"]["config"], where=str(folder))
     started["identity"]["config"] = config.model_dump(mode="json")
     return started

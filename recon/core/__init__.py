@@ -1,8 +1,7 @@
 """What every layer stands on: values, geometry, errors, settings, compiled loops.
 
 - `values/`: the data types, checked when they are made; `geometry/se3.py`: poses;
-- `errors.py`: one tree, one line each; `settings.py`: the base of all settings,
-  `renamed.py`: what they were called before;
+- `errors.py`: one tree, one line each; `settings.py`: the base of all settings;
 - `kernels/compiled.py`: how loops are compiled; `kernels/cache.py`: where machine code is kept;
 - `kernels/voxels.py`: hashes and sets of packed cells;
 - `lazy.py`: libraries, and what draws values, loaded when they are used;

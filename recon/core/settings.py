@@ -176,8 +176,11 @@ def settings_error(
 ) -> SettingsError:
     """Describe pydantic's first error in one line; ``names`` are suggested for an unknown one."""
     first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
+    key, inner = ".".join(str(part) for part in first["loc"]), first["input"]
     if first["type"] == "extra_forbidden":
+        while isinstance(inner, Mapping) and inner:  # of an unknown group, its first setting
+            key = f"{key}.{(name := next(iter(inner)))}"
+            inner = inner[name]
         return SettingsError(
             f"unknown setting {key!r}", where=where, hint=suggest_names(key, names)
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -75,7 +74,6 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "colmap": Product("colmap", colmap_product, needs_images=True),
     "nerfstudio": Product("nerfstudio", nerfstudio_product, needs_images=True),
 }
-FORMER_PRODUCTS: Final = {"occupancy": "grid-geotiff"}  # before 1.0
 USUAL: Final = ("cloud", "octomap", "grid", "mesh")  # unless something else is asked for
 OF_A_PAIR: Final = ("cloud", "mesh")
 _DOUBTED: Final = 2.0  # standard deviations between two heights, of which one is wrong then
@@ -217,10 +215,6 @@ def write_product(context: ExportContext, name: str, path: Path) -> ExportResult
 def known_products(products: Sequence[str], *, pair: bool) -> Sequence[str]:
     """Return the requested products, or the usual ones."""
     possible = OF_A_PAIR if pair else (*PRODUCTS,)
-    for former in FORMER_PRODUCTS.keys() & set(products):
-        note = f"--to {former} is --to {FORMER_PRODUCTS[former]} since 1.0"
-        warnings.warn(note, FutureWarning, stacklevel=2)
-    products = [FORMER_PRODUCTS.get(product, product) for product in products]
     for product in products:
         if product not in possible:
             what, hint = "unknown product", None

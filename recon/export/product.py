@@ -12,7 +12,6 @@ import numpy as np
 
 from recon.core.errors import OutputError, ReconError, SourceError
 from recon.core.progress import tracked
-from recon.core.renamed import current_names
 from recon.core.summary import Figures
 from recon.core.values import Recorded, Rig, StereoPair
 from recon.core.values.arrays import Bool, Float64, UInt8
@@ -200,9 +199,8 @@ def _opened(session: Session, moved: Path | None) -> StereoSource:
         known = {"source": None, "kind": None, "mark": {}, **info.start.get(IMAGES, {})}
         path, kind = moved or (known["source"] and Path(known["source"])), known["kind"]
         mark = {"frames": info.frames, **known["mark"]}
-        config, _ = current_names(info.config)
-        street = StreetSettings.parse(config.get("street", {}))
-        settings = SourceSettings.parse(config.get("source", {}))
+        street = StreetSettings.parse(info.config.get("street", {}))
+        settings = SourceSettings.parse(info.config.get("source", {}))
     if info.description == SyntheticSource.description:
         source: StereoSource = SyntheticSource(street)
     elif path is None:

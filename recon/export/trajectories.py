@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 
 from recon.core.geometry.se3 import invert, quaternion_from_rotation
-from recon.core.renamed import with_former_keys
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.io.atomic import write_text
@@ -66,7 +65,7 @@ def export_paths(session: Session, joined: Bool, T_base_camera: Float64, folder:
             ]
             for kind in ("closed", "refused")
         }
-        write_json(folder / "loops.json", with_former_keys(loops))
+        write_json(folder / "loops.json", loops)
 
 
 def export_sessions(map_: MapFile, folder: Path) -> None:

@@ -16,7 +16,6 @@ from typing_extensions import Self
 
 from recon.core import progress
 from recon.core.machine import peak_memory_mb, versions
-from recon.core.renamed import with_former_keys
 from recon.core.settings import Settings
 from recon.core.summary import RunSummary
 from recon.core.work import Stopwatch, use_threads
@@ -107,7 +106,7 @@ class Run(RunDirectory):
         inputs = tuple(inputs)
         self.check_targets(inputs)
         complete = replace(summary, **self._cost, out=str(self.folder))
-        self.write_json(SUMMARY, with_former_keys(complete.to_json()))
+        self.write_json(SUMMARY, complete.to_json())
         with self.stage("hash"):
             hashed = fingerprint(inputs)
         self.write_json(

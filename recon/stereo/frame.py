@@ -6,7 +6,6 @@ Points have their uncertainties; flying edges and outliers are left out.
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
@@ -14,11 +13,10 @@ from typing import Any, Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, SerializeAsAny, model_validator
+from pydantic import Field, SerializeAsAny
 from typing_extensions import Self
 
 from recon.core.errors import ShapeError
-from recon.core.renamed import current_names
 from recon.core.settings import Length, Settings
 from recon.core.values import (
     Disparity,
@@ -329,11 +327,6 @@ class StereoSettings(Settings):
     matching: SerializeAsAny[MatchingSettings] = MatchingSettings()  # with those of plug-ins
     cloud: CloudSettings = CloudSettings()
     filters: FilterSettings = FilterSettings()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _read_old_names(cls, values: Any) -> Any:
-        return current_names(values)[0] if isinstance(values, Mapping) else values
 
     def with_matcher(self, matcher: str | Matcher | None) -> Self:
         """Return the settings with another matcher, by name or as an object; None = unchanged.

@@ -17,7 +17,6 @@ import pytest
 from recon.commands.cameras import record, run_calibrate, run_capture, run_rectify
 from recon.commands.config import load_config
 from recon.core.errors import CalibrationError, OutputError, ReconError, SourceError
-from recon.core.renamed import with_former_keys
 from recon.core.values import RectifiedCamera, StereoPair
 from recon.core.values.board import parse_board
 from recon.io import atomic
@@ -72,7 +71,7 @@ def run(drawn, tmp_path_factory):
 def test_images_give_the_true_rig_with_its_report_which_comes_back_from_every_format(run, tmp_path):
     summary, rig = run.summary.to_json(), board_rig()
     written = json.loads((Path(summary["out"]) / "summary.json").read_text())
-    assert written == with_former_keys(json.loads(json.dumps(summary)))
+    assert written == json.loads(json.dumps(summary))
     assert summary["stereo_rms_px"] < 0.15
     assert summary["epipolar_px"] < 0.1
     # Corners of rendered images are good to about 0.1 px, and eight views are few.

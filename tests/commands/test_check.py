@@ -20,7 +20,7 @@ from recon.map.map import Map
 from recon.map.store.records import Store
 from recon.map.store.trees import FRAMES, RAYS
 
-GOLDEN = Path(__file__).parents[1] / "map/store/format_1.recon"
+GOLDEN = Path(__file__).parents[1] / "map/store/format_2.recon"
 
 
 @pytest.fixture
@@ -60,8 +60,8 @@ def test_what_is_in_a_map(golden):
         for number, one in enumerate(map_.sessions):
             kinds = found.records[str(number)]
             assert (kinds["rays"], kinds["keyframe"]) == (len(one), len(one.keyframes.frames))
-    assert (found.format, found.newest_format, found.damaged) == (1, 2, {})
-    assert found.versions["0"]["recon"] == "0.1.0"
+    assert (found.format, found.newest_format, found.damaged) == (2, 2, {})
+    assert found.versions["0"]["recon"] == "1.0.0"
     rows = _records(golden)
     assert sum(sum(one.values()) for one in found.records.values()) == len(rows)
     size = sum(sum(one.values()) for one in found.bytes.values())

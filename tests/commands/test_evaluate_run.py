@@ -14,7 +14,6 @@ from recon.core.errors import (
     SettingsError,
 )
 from recon.core.geometry.se3 import exp_so3, invert, make_transform, transform_cloud
-from recon.core.renamed import with_former_keys
 from recon.core.values import PointCloud, Trajectory
 from recon.evaluation.trajectory import TrajectoryRules
 from recon.io.models.ply import read_ply, write_ply
@@ -96,7 +95,7 @@ def test_a_fit_of_the_paths_undoes_what_both_share_and_clouds_are_coloured_by_th
     assert (found["f_score"], found["alignment"]) == (1.0, "poses")
     # The written path has twelve decimals; the turn made was 0.84 degrees.
     assert found["path_turned_deg"] == pytest.approx(np.degrees(np.sqrt(2.16e-4)), rel=1e-3)
-    assert json.loads((out / "summary.json").read_text()) == with_former_keys(found)
+    assert json.loads((out / "summary.json").read_text()) == found
     for cloud in (read_ply(out / "error.ply"), read_ply(out / "missed.ply")):
         assert len(cloud) == 21000
         # All lie on the truth: the blue end of the scale.
@@ -229,7 +228,7 @@ def test_a_folder_gets_report_figures_and_aligned_paths(folder):
     assert {path.name for path in out.iterdir()} == {f"{name}.png" for name in figures} | {
         "estimate_aligned_tum.txt", "truth_tum.txt", "report.html", "run.json", "summary.json",
     }  # fmt: skip
-    assert json.loads((out / "summary.json").read_text()) == with_former_keys(found)
+    assert json.loads((out / "summary.json").read_text()) == found
     page = (out / "report.html").read_text()
     assert "half.txt against truth_tum.txt" in page
     assert page.count("<img") == 4

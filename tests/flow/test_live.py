@@ -16,7 +16,6 @@ from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
 from recon.core.errors import CalibrationError, MappingError, SettingsError, SourceError
 from recon.core.progress import Counted, Silent, showing
-from recon.core.renamed import with_former_keys
 from recon.core.values import RectifiedCamera
 from recon.io.cameras.calibration import read_calibration
 from recon.io.models.rasters import read_grid
@@ -100,7 +99,7 @@ def test_a_drive_that_is_kept_up_with_gives_the_same_map(street, mapped, patient
     assert summary["live"]["frames_dropped"] == summary["live"]["frames_not_matched"] == 0
     latency_ms = summary["live"]["latency_ms"]
     assert 0 < latency_ms["p50"] <= latency_ms["p95"] <= latency_ms["max"]
-    assert summary_of(tmp_path / "live") == with_former_keys(summary)
+    assert summary_of(tmp_path / "live") == summary
 
 
 def test_a_machine_that_is_much_too_slow_has_poses_and_is_told_why_there_is_no_map(

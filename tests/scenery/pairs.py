@@ -103,13 +103,8 @@ def _clear_sky(directions: Float64, to_sun: Float64) -> Float64:
     return np.asarray(blue + (white - blue) * haze + glow * [1.0, 0.95, 0.85])
 
 
-def hard_pairs(seed: int, scale: float = 1.0) -> dict[str, HardPair]:
-    """Render all scenes of a seed, in images of 640 by 480 pixels times a scale."""
-    return {name: hard_pair(name, seed, scale) for name in HARD_SCENES}
-
-
 def hard_pair(name: str, seed: int, scale: float = 1.0) -> HardPair:
-    """Render one of the scenes."""
+    """Render one of `HARD_SCENES`, in images of 640 by 480 pixels times a scale."""
     scene = hard_scene(name, seed)
     width, height = (round(scale * k) for k in _SIZE)
     focal, cx, cy = _FOCAL * width, 0.5 * (width - 1), 0.5 * (height - 1)

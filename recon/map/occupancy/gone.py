@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from recon.core.geometry.se3 import apply, invert
+from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.values import OccupancyVoxels, RayCloud, RectifiedCamera
 from recon.core.values.arrays import Bool, Float64, Int64, UInt8
 from recon.core.values.grid import log_odds
@@ -36,6 +37,7 @@ _AS_FAR: Final = math.sqrt(2.0)
 _AS_SEEN: Final = math.cos(math.radians(30.0))
 """Views from within this ratio of a distance and this angle are alike: the gradient of an image of
 a surface then falls to 1/√2 · cos 30° = 0.61 at the most."""
+_CUBE: Final = 16  # voxels along a cube that is in view or not as a whole
 _LESS: Final = 0.5
 _SIGMAS: Final = 2.0
 _PLAINEST: Final = 0.05  # fraction of the squares of an image
@@ -69,13 +71,18 @@ def find_gone(voxels: OccupancyVoxels, views: Iterable[FrameView]) -> Bool:
     hits, texture_sum, state = np.zeros((3, len(places)))
     seen_from = np.ones_like(places)  # from where each was hit last, relative to it
     low, high, hit_more, missed = map(log_odds, _PROBABILITIES)
+    cubes, cube = np.unique(pack_keys(voxels.keys[occupied] // _CUBE), return_inverse=True)
+    size_m = _CUBE * voxels.resolution_m
+    middles = size_m * (unpack_keys(cubes) + 0.5)
     for rays, T, camera in views:
         if not (rays.texture.size and len(rays)):
             continue
         near, far, before, texture, sigma = _seen_in(rays, camera)
-        ahead = apply(invert(T), places)
+        in_view = _in_view(apply(invert(T), middles), size_m, camera, rays.texture.shape)
+        inside = np.flatnonzero(in_view[cube])
+        ahead = apply(invert(T), places[inside])
         rows, cell = _squares(ahead, camera, rays.texture.shape)
-        inverse = 1 / ahead[rows, 2]
+        rows, inverse = inside[rows], 1 / ahead[rows, 2]
         off = _SIGMAS * sigma + voxels.resolution_m * inverse**2
         seen = (far[cell] - off <= inverse) & (inverse <= near[cell] + off)
         hit = rows[seen]
@@ -132,6 +139,20 @@ def _squares(xyz: Float64, camera: RectifiedCamera, shape: tuple[int, ...]) -> t
     )
     inside = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
     return ahead[inside], (row * shape[1] + column)[inside].astype(np.int64)
+
+
+def _in_view(
+    middles: Float64, size_m: float, camera: RectifiedCamera, shape: tuple[int, ...]
+) -> Bool:
+    """Return which cubes, by their middles (N, 3) in camera axes, may reach into the image."""
+    x, y, z = middles.T
+    reach_m, focal = math.sqrt(3.0) / 2 * size_m, camera.focal_px
+    inside = z > MIN_DEPTH_M - reach_m
+    for across, centre, squares in ((x, camera.cx_px, shape[1]), (y, camera.cy_px, shape[0])):
+        for sign, edge in ((1, centre + 0.5), (-1, centre + 0.5 - CELL_PX * squares)):
+            # The plane through the camera and this side of the image.
+            inside &= sign * (focal * across + edge * z) >= -reach_m * math.hypot(focal, edge)
+    return np.asarray(inside)
 
 
 def _last(values: Float64) -> Float64:

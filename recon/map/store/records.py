@@ -109,7 +109,7 @@ def _begin_to_write(database: sqlite3.Connection) -> None:
 
 
 def check_format(database: sqlite3.Connection, path: Path) -> None:
-    """Refuse files of other programs, of newer versions, and with tables of another make."""
+    """Refuse files of other programs, of other versions, and with tables of another make."""
     try:
         (ours,) = database.execute("PRAGMA application_id").fetchone()
         (number,) = database.execute("PRAGMA user_version").fetchone()
@@ -118,14 +118,12 @@ def check_format(database: sqlite3.Connection, path: Path) -> None:
         if "lock" in str(error):
             raise FormatError("another process is opening the map", where=path) from error
         raise FormatError("not a map of recon, or damaged", where=path, got=str(error)) from error
-    if ours == _OURS and number > FORMAT:
-        raise FormatError(
-            "the map was written by a newer version of recon",
-            where=path,
-            got=f"format {number}",
-            expected=f"at most {FORMAT}",
-            hint="update recon",
-        )
+    if ours == _OURS and number != FORMAT:
+        what, hint = "a newer version of recon", "update recon"
+        if number < FORMAT:
+            what, hint = "a version of recon before 1.0", "map the drive again"
+        how = {"got": f"format {number}", "expected": f"format {FORMAT}", "hint": hint}
+        raise FormatError(f"the map was written by {what}", where=path, **how)
     if ours != _OURS or tables != {_TABLE}:
         raise FormatError("not a map of recon", where=path)
 

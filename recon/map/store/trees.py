@@ -157,19 +157,9 @@ def _columns(shape: Sequence[int]) -> int:
 Value = TypeVar("Value")
 
 
-FORMER_FIELDS: Final = {
-    "stretch": "lengthening",
-    "late": "time_offset",
-    "late_sigma": "time_offset_sigma",
-    "dense_share": "dense_ratio",
-}
-"""Fields of records that versions before 1.0 wrote, and what they are called now."""
-
-
 def value_in(kind: type[Value], tree: Mapping[str, Any]) -> Value:
     """Return a dataclass of a tree of its fields; each part is checked against its type."""
-    named = {FORMER_FIELDS.get(name, name): part for name, part in tree.items()}
-    return kind(**{name: _part(kind, name, part) for name, part in named.items()})
+    return kind(**{name: _part(kind, name, part) for name, part in tree.items()})
 
 
 def _part(kind: Any, name: str, part: Any) -> Any:
@@ -282,7 +272,7 @@ def rig_in(content: Mapping[str, Any], name: str) -> KnownRig | None:
     size = as_raw(given).left
     check_size(calibration, size.width_px, size.height_px, "calibration")
     shown = active(given)
-    tree = {FORMER_FIELDS.get(key, key): part for key, part in content["fitted"].items()}
+    tree = content["fitted"]
     count = len(array_in(tree, "values", np.float64, (None,)))
     covariance = array_in(tree, "covariance", np.float64, (count, count))
     array_in(tree, "lengthening", np.float64, (count,))

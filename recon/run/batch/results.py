@@ -18,7 +18,6 @@ from typing import Any, Final
 
 from recon.core.errors import FormatError, SettingsError
 from recon.core.progress import series, stage
-from recon.core.renamed import without_former_keys
 from recon.core.summary import Figures, inline, optional
 from recon.io.atomic import is_locked
 from recon.io.files import read_text, reading, resolved
@@ -192,7 +191,7 @@ def result_of(job: Job, outcome: Outcome, folder: Path) -> JobResult:
             outcome = replace(outcome, seconds=float(summary.get("seconds", 0.0)))
         warnings = tuple(map(str, summary.get("warnings", ())))
         remark = next(iter(warnings), "")
-        figures = {**dict(_flat(without_former_keys(summary))), "warnings": len(warnings)}
+        figures = {**dict(_flat(summary)), "warnings": len(warnings)}
         map_ = out / "map" / STARTED
         if (length_m := figures.get("path_length_m")) and map_.is_file():
             figures.setdefault("map_mb_per_km", map_.stat().st_size / 1e3 / length_m)

@@ -1,7 +1,7 @@
-"""How `format_1.recon` was made: two drives through a rendered street, the second one linked.
+"""How `format_2.recon` was made: two drives through a rendered street, the second one linked.
 
 ``python -m tests.map.store.golden FILE`` makes another one with the code as it is. The committed
-file is of the first version of the format, and stays: whatever comes later reads it.
+file was written by recon 1.0.0, and stays: whatever comes later within a major version reads it.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""A map of the first format, kept as it was written, opens and gives what it gave then."""
+"""A map that recon 1.0.0 wrote, kept as it was, opens and gives what it gave then."""
 
 import shutil
 from pathlib import Path
@@ -10,11 +10,12 @@ from recon.core.errors import FormatError
 from recon.core.geometry.se3 import invert
 from recon.map.localize.localizer import State
 from recon.map.map import Map
+from recon.map.sessions.placed import settings_of
 from tests.map.store import golden
 from tests.map.walls import cloud_of, voxels_of
 from tests.scenery.film import film
 
-FILE = Path(__file__).with_name("format_1.recon")
+FILE = Path(__file__).with_name("format_2.recon")
 # Means over all points, as the version that wrote the file gave them.
 CLOUD = {
     "xyz": [10.049688, -2.766401, 0.698225], "rgb": [75.895833, 82.229167, 74.083333],
@@ -72,11 +73,18 @@ def test_a_pair_of_the_street_is_found_where_it_was_taken(map_):
     assert np.linalg.norm(off[:3, 3]) < 0.01
 
 
-def test_a_map_of_a_format_to_come_is_refused_by_its_number(tmp_path):
-    newer = tmp_path / "map.recon"
-    shutil.copy(FILE, newer)
-    content = bytearray(newer.read_bytes())
-    content[60:64] = (99).to_bytes(4, "big")  # where SQLite keeps `user_version`
-    newer.write_bytes(content)
-    with pytest.raises(FormatError, match=r"newer version of recon.*format 99"):
-        Map.open(newer)
+def test_its_settings_are_those_of_today(map_):
+    assert settings_of(map_.session()).matching == golden.CONFIG.matching
+
+
+@pytest.mark.parametrize(("number", "words"), [
+    (99, r"a newer version of recon \(got format 99"), (1, "before 1.0.*map the drive again"),
+])  # fmt: skip
+def test_a_map_of_another_format_is_refused_by_its_number(number, words, tmp_path):
+    other = tmp_path / "map.recon"
+    shutil.copy(FILE, other)
+    content = bytearray(other.read_bytes())
+    content[60:64] = number.to_bytes(4, "big")  # where SQLite keeps `user_version`
+    other.write_bytes(content)
+    with pytest.raises(FormatError, match=words):
+        Map.open(other)

@@ -138,6 +138,16 @@ def test_the_table_of_runs(weeks, tmp_path):
     assert (out / "time.png").stat().st_size > 1000
 
 
+def test_a_run_of_1_0_0_which_has_some_figures_under_two_names_is_read(tmp_path):
+    twice = {
+        "rig": {"epipolar_error_px": 0.1, "rows_px": 0.1},
+        "segments": [],
+        "drive_sessions": [],
+    }
+    (one,) = runs_by_date([run(tmp_path, "a", **twice)], tmp_path)
+    assert one.figures["rig.epipolar_error_px"] == 0.1
+
+
 @pytest.mark.parametrize("text", ["[]", "{", '{"sessions": 5}', '{"warnings": 5}'])
 def test_what_is_no_run_is_one_line(tmp_path, text):
     with pytest.raises(ReconError, match="there is no run"):
