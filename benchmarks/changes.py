@@ -2,16 +2,16 @@
 
 A car has changed if it stands in the street in one of the two weeks only. It counts if its drive
 saw 30 % of its longer side, by the true depth of every sixth frame, up to where the clouds of the
-maps end (``reach_m``); and if the other drive saw at least half of those places from within 25 m:
-`free`, if it saw farther there, or else `replaced`, such as by another car in the bay. It is found
-if the box of a thing of its kind overlaps its own; of one that was replaced, of either kind. A
-thing is false if its box overlaps nothing that changed: cars, hoarding, fence, the growing tree;
-crowns of trees, where leaves are of another season.
+maps end (``reach_m``); and if the other drive saw at least half of those places from within 25 m,
+or what is beyond them. It was `replaced` if another car stands there on the other day, else its bay
+is `free` then. It is found if the box of an object of its kind overlaps its own; of one that was
+replaced, of either kind. An object is false if its box overlaps nothing that changed: cars,
+hoarding, fence, the growing tree; crowns of trees, where leaves are of another season.
 
 WEEKS has the weeks as folders (image_2, image_3, calib.txt, times.txt, T_street_first.npy), or they
 are rendered; RUNS their maps, which are made where they are missing.
 
-Of HALVES, two runs of one drive, nothing but what drives may be found; all things are counted.
+Of HALVES, two runs of one drive, nothing but what drives may be found; all objects are counted.
 
 Example: python benchmarks/changes.py RUNS --weeks WEEKS --pairs 0-1,50-51 --json
 """
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.halves is not None:
         before, after = options.halves
         found = run_diff(before, after, MapOptions("diff", options.runs / "halves"))
-        rows = [{"things": len(found.things), "not_compared": found.not_compared_ratio}]
+        rows = [{"objects": len(found.objects), "not_compared": found.not_compared_ratio}]
     else:
         pairs = [[*map(int, pair.split("-"))] for pair in options.pairs.split(",")]
         rows = [weeks(one, other, options.runs, options.weeks) for one, other in pairs]
@@ -79,7 +79,7 @@ def weeks(before: int, after: int, runs: Path, rendered: Path | None) -> dict[st
     summary = json.loads((out / "summary.json").read_text())
     first = drive(before).world.T_street_camera[0]
     boxes = [(one, street_box(one, first @ np.linalg.inv(summary["T_map_world"])))
-             for one in summary["things"]]  # fmt: skip
+             for one in summary["objects"]]  # fmt: skip
     reach_m = min(json.loads((run / "summary.json").read_text())["reach_m"] for run in both)
     cars = [
         *changed_cars(before, after, "went", reach_m),
@@ -99,7 +99,7 @@ def weeks(before: int, after: int, runs: Path, rendered: Path | None) -> dict[st
     real = [box for *_, box in cars] + [*other_changes(before, after)]
     false = [one["number"] for one, its in boxes if not any(overlap(its, box) for box in real)]
     path_m = drive(before).trajectory.path_length_m
-    return {"weeks": (before, after), "found_of": counted, "missed": missed, "things": len(boxes),
+    return {"weeks": (before, after), "found_of": counted, "missed": missed, "objects": len(boxes),
             "false": false, "false_per_100_m": round(100 * len(false) / path_m, 2),
             "seconds": summary["seconds"],
             "not_compared": summary["not_compared_ratio"]}  # fmt: skip
@@ -123,14 +123,17 @@ def changed_cars(
     week: int, other: int, kind: str, reach_m: float
 ) -> Iterator[tuple[str, str | None, Any, Any]]:
     """Yield the cars of a week that are not there in another, and whether both drives saw them."""
-    there = {car.name for car in parked_cars(other)}
+    there = {car.name: car.box_m for car in parked_cars(other)}
     for car in parked_cars(week):
         if car.name not in there:
-            yield kind, how_seen(car.box_m, week, other, reach_m), car.name, car.box_m
+            taken = any(overlap(car.box_m, box) for box in there.values())
+            how = "replaced" if taken else "free"
+            seen = both_saw(car.box_m, week, other, reach_m)
+            yield kind, how if seen else None, car.name, car.box_m
 
 
-def how_seen(box: np.ndarray, week: int, other: int, reach_m: float) -> str | None:
-    """Return whether its place is free or taken on the other day; None = a drive saw too little."""
+def both_saw(box: np.ndarray, week: int, other: int, reach_m: float) -> bool:
+    """Return whether one drive saw enough of a car, and the other one its place."""
     cells = np.zeros((0, 3), np.int64)
     for T, points, _ in views(week):
         street = points[points[:, 2] < reach_m] @ T[:3, :3].T + T[:3, 3]
@@ -138,9 +141,9 @@ def how_seen(box: np.ndarray, week: int, other: int, reach_m: float) -> str | No
         cells = np.unique(np.vstack([cells, np.floor(street[near] / CELL_M).astype(int)]), axis=0)
     length, width, height = box[1] - box[0]
     if len(cells) < LEAST_SIDE * max(length, width) * height / CELL_M**2:
-        return None
+        return False
     places = (cells + 0.5) * CELL_M
-    looked, farther = np.zeros((2, len(places)), bool)
+    looked = np.zeros(len(places), bool)
     for T, _, depth in views(other):
         ahead = (places - T[:3, 3]) @ T[:3, :3]
         z = np.maximum(ahead[:, 2], 0.1)
@@ -149,12 +152,8 @@ def how_seen(box: np.ndarray, week: int, other: int, reach_m: float) -> str | No
         v = np.rint(camera.focal_px * ahead[:, 1] / z + camera.cy_px).astype(int)
         inside = (ahead[:, 2] > 0.5) & (z < RANGE_M) & (u >= 0) & (v >= 0)
         rows = np.flatnonzero(inside & (u < depth.shape[1]) & (v < depth.shape[0]))
-        seen = depth[v[rows], u[rows]]
-        looked[rows[seen > z[rows] - 0.5]] = True
-        farther[rows[seen > z[rows] + 0.5]] = True
-    if looked.mean() < LEAST_SEEN:
-        return None
-    return "free" if farther.mean() >= LEAST_SEEN else "replaced"
+        looked[rows[depth[v[rows], u[rows]] > z[rows] - 0.5]] = True
+    return bool(looked.mean() >= LEAST_SEEN)
 
 
 @cache
@@ -193,13 +192,13 @@ def box_of(vertices: np.ndarray) -> np.ndarray:
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
-def street_box(thing: dict[str, Any], T_street_map: np.ndarray) -> np.ndarray:
-    """Return the lowest and highest corner of the box of a thing, street axes."""
-    turn = math.radians(thing["heading_deg"])
+def street_box(changed: dict[str, Any], T_street_map: np.ndarray) -> np.ndarray:
+    """Return the lowest and highest corner of the box of an object, street axes."""
+    turn = math.radians(changed["heading_deg"])
     c, s = math.cos(turn), math.sin(turn)
-    half = np.array([thing["length_m"], thing["width_m"], thing["height_m"]]) / 2
+    half = np.array([changed["length_m"], changed["width_m"], changed["height_m"]]) / 2
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    corners = np.array(thing["centre_m"]) + (signs * half) @ np.array(
+    corners = np.array(changed["centre_m"]) + (signs * half) @ np.array(
         [[c, s, 0], [-s, c, 0], [0, 0, 1]]
     )
     street = corners @ T_street_map[:3, :3].T + T_street_map[:3, 3]

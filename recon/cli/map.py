@@ -105,6 +105,7 @@ def map_(
             default="2 with SOURCE, else all",
         ),
     ] = None,
+    changes: opt.Compared = False,
     date: Annotated[
         str | None,
         opt.option(
@@ -151,6 +152,8 @@ def map_(
         raise typer.BadParameter("--poses leaves nothing for --prior to do; give one of them")
     if out is not None and resume is not None and os.path.realpath(out) != os.path.realpath(resume):
         raise typer.BadParameter("--out and --resume name different folders")
+    if changes and into is None:
+        raise typer.BadParameter("--changes compares a drive with those of --into RUN")
     _check_into(into, source, remove, keep, out, resume, workers, scheduler, view or None)
     if source is None and (date is not None or (resume is None and into is None)):
         raise typer.BadParameter("give SOURCE, or --resume FOLDER, which has its --date")
@@ -175,6 +178,7 @@ def map_(
             poses_file=poses,
             prior_from=prior,
             keep=Keep.parse(keep, "--keep") if keep else None,
+            changes=changes,
             date=None if date is None else given_date(date, "--date"),
         )
         if resume is not None:
@@ -258,6 +262,7 @@ def merge(
     ] = None,
     antenna: opt.Antenna = None,
     mesh: opt.Mesh = True,
+    changes: opt.Compared = False,
     *,
     shared: opt.Shared,
 ) -> None:
@@ -279,7 +284,7 @@ def merge(
         from recon.commands.merge import run_merge
 
         settings = run_settings(runs[0], shared.config, shared.changes, preset=shared.preset)
-        options = shared.options("merge", out, mesh=mesh)
+        options = shared.options("merge", out, mesh=mesh, changes=changes)
         summary = run_merge(runs, settings, options, opt.survey_of(georeference, antenna))
     shared.show(summary)
 
@@ -296,7 +301,7 @@ def diff(
 
     Each may hold several drives. They are linked by places that both saw. Points
     of either day are the same, came, went, or could not be compared, since the
-    other day did not look there. Things are listed with place, size, volume, when
+    other day did not look there. Objects are listed with place, size, volume, when
     they were seen, and a picture of both days.
 
     Examples:

@@ -98,6 +98,10 @@ To = Annotated[
     ),
 ]
 Mesh = Annotated[bool, option("Reconstruct the surface mesh.")]
+Compared = Annotated[
+    bool,
+    option("Report what came and went with the newest drive (takes as long as recon diff)."),
+]
 Antenna = Annotated[
     str | None,
     option("Antenna or prism, from the left camera: metres forward, left, up.", metavar="X,Y,Z"),

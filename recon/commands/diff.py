@@ -13,10 +13,10 @@ from recon.core.values.arrays import Float64
 from recon.export.changes import Pictures, write_changes
 from recon.io.files import StrPath
 from recon.map.changes.compare import compare, gather
-from recon.map.changes.things import Thing
+from recon.map.changes.objects import ChangedObject
 from recon.map.map import Map
 from recon.map.store.map_file import MAP_FILE
-from recon.report.changes_page import write_changes_page, write_things
+from recon.report.changes_page import write_changes_page, write_objects
 from recon.run.finished import refuse_as_target
 from recon.run.run import WholeRun
 
@@ -27,16 +27,16 @@ class DiffSummary(RunSummary):
 
     before: str
     after: str
-    counts: Mapping[str, int]  # by ``came`` and ``went``
+    changes: Mapping[str, int]  # objects that ``came`` or ``went``
     not_compared_ratio: Mapping[str, float]  # of the surface of either day
-    things: Sequence[Thing]  # the ones with most points first
+    objects: Sequence[ChangedObject]  # the ones with most points first
     T_map_world: Float64  # (4, 4)
 
     def rows(self) -> Rows:
         ratios = self.not_compared_ratio
         unseen = f"{ratios['before']:.0%} of the first, {ratios['after']:.0%} of the second"
         return [
-            (", ".join(f"{counted(n, 'thing')} {name}" for name, n in self.counts.items()),),
+            (", ".join(f"{counted(n, 'object')} {name}" for name, n in self.changes.items()),),
             *self.folder_row(),
             ("cloud", "changes.ply", "by class: same, came, went, not compared"),
             ("table", "changes.csv", "place, size, volume, first and last seen"),
@@ -79,18 +79,18 @@ def run_diff(before: StrPath, after: StrPath, options: MapOptions | None = None)
         with run.stage("write"):
             write_changes(found, run.path("changes"))
             pictures = Pictures(map_, found)
-            things = pictures.write(run.path)
-            write_things(run.path("changes.csv"), things)
+            objects = pictures.write(run.path)
+            write_objects(run.path("changes.csv"), objects)
         days = {"before": found.before, "after": found.after}
         summary = DiffSummary(
             before=str(before),
             after=str(after),
-            counts={kind: sum(one.change == kind for one in things) for kind in ("came", "went")},
+            changes=found.counts,
             not_compared_ratio={name: day.not_compared_ratio for name, day in days.items()},
-            things=things,
+            objects=objects,
             T_map_world=map_.first.T_map_world,
             warnings=[*map_.doubts, *pictures.missing.values()],
         )
         with run.report(summary) as summary:
-            write_changes_page(things, summary.to_json(), run)
+            write_changes_page(objects, summary.to_json(), run)
         return run.finish(summary, source=f"{before} and {after}", inputs=files)

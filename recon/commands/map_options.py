@@ -74,6 +74,7 @@ class MapOptions:
         namespace: What the names of its topics and frames begin with.
         stamp_ns: Makes their stamps of the times of frames; None = they are seconds since 1970.
         keep: What a map keeps of its drives, into which another is mapped; None = the default.
+        changes: Whether what came and went with the newest of several drives is reported.
         date: Day of the drive, where the user gives it; None = by its stamps or files.
         bag: Whether they are written into a bag in the folder of the run, too.
     """
@@ -100,6 +101,7 @@ class MapOptions:
     stamp_ns: Callable[[float], int] | None = None
     bag: bool = False
     keep: Keep | None = None
+    changes: bool = False
     date: Date | None = None
 
     @property

@@ -203,6 +203,7 @@ class JoinedSummary(RunSummary):
     forgotten: Sequence[Forgotten]  # drives that left the map, since it was made
     map_mb_per_km: float | None  # size of map.recon, by the paths of the drives in it
     tended: str = hidden("")  # what was forgotten now
+    changes: Mapping[str, int] | None = optional()  # objects that ``came`` or ``went``
     made: UsualProducts = inline()
     T_map_world: Float64  # (4, 4)
 
@@ -214,9 +215,10 @@ class JoinedSummary(RunSummary):
         off = "" if misfit_m is None else f"{metres(misfit_m)} off measured positions (RMS)"
         held = ", ".join(text for text in (places if drives > 1 else "", off) if text)
         path = f"{counted(self.frames, 'frame')}, {metres(self.path_length_m)} of path"
+        news = "".join(f", {n} {change}" for change, n in (self.changes or {}).items())
         full = bool(self.tended and self.made.mesh.faces)
         return [
-            (f"map of {linked}{apart} {'drive' if drives == 1 else 'drives'}, {path}",),
+            (f"map of {linked}{apart} {'drive' if drives == 1 else 'drives'}, {path}{news}",),
             *self.folder_row(),
             *self.made.rows(),
             *([("forgot", self.tended)] if self.tended else []),

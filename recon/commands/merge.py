@@ -29,6 +29,7 @@ from recon.export.product import ExportContext
 from recon.export.trajectories import export_sessions
 from recon.io.files import resolved
 from recon.look.rig import RefinedRig
+from recon.map.changes.compare import compare
 from recon.map.drive.drive import session_info
 from recon.map.drive.sequence import check_map
 from recon.map.map import Map
@@ -181,13 +182,17 @@ def _make_joined(
             placed = place_map(map_, settings, run.threads)
         context = ExportContext(map_, placed, settings.mesh, threads=run.threads)
         made = make(context, run.content, options.products, run.watch)
+        with run.stage("changes"):
+            several = options.changes and len(map_.linked) > 1
+            changed = compare(map_, [map_.linked[-1].number], run.threads) if several else None
         summary = replace(
             _figures(map_, UsualProducts.of(made), tended),
+            changes=None if changed is None else changed.counts,
             warnings=[*left_out, *_warnings(map_), *_of_rigs(map_, new), *made.warnings],
         )
         export_sessions(map_, run.content)
         with run.report(summary) as summary:
-            write_joined_page(map_, made, summary.to_json(), run)
+            write_joined_page(map_, made, summary.to_json(), run, changed)
         map_.close()
         names, axes = ", ".join(drive.name for drive in summary.sessions), summary.T_map_world
         record = {"T_map_world": axes.tolist()}

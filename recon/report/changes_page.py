@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from recon.io.atomic import write_text
-from recon.map.changes.things import Thing
+from recon.map.changes.objects import ChangedObject
 from recon.report.page import run_figures, run_section, write_page
 from recon.report.sections import Image, Page, Row, Section, Table, csv_text, known
 from recon.run.directory import RunDirectory
@@ -20,12 +20,12 @@ _CAPTION: Final = (
 )
 
 
-def _row(one: Thing) -> Row:
+def _row(one: ChangedObject) -> Row:
     volume = known("{:.2f}", one.volume_m3, "–") + known(" ± {:.2f}", one.volume_sigma_m3)
     middle = ", ".join(f"{x:.1f}" for x in one.centre_m)
     size = f"{one.length_m:.1f} × {one.width_m:.1f} × {one.height_m:.1f}"
     ends = (
-        f"{end.date_utc or f'{end.time_s:.1f} s'}, frame {end.frame} of {end.drive}"
+        f"{end.date or f'{end.time_s:.1f} s'}, frame {end.frame} of {end.drive}"
         for end in (one.first_seen, one.last_seen)
     )
     picture = "below" if one.picture else "no images"
@@ -33,28 +33,33 @@ def _row(one: Thing) -> Row:
 
 
 def write_changes_page(
-    things: Sequence[Thing], summary: Mapping[str, Any], run: RunDirectory
+    objects: Sequence[ChangedObject], summary: Mapping[str, Any], run: RunDirectory
 ) -> None:
     """Write ``report.html``: the table, and pictures of both days."""
     before, after, ratios = summary["before"], summary["after"], summary["not_compared_ratio"]
     pictures = [
         Image(f"{one.number}: {one.change}", run.path(one.picture).read_bytes(), "Before | after")
-        for one in things
+        for one in objects
         if one.picture is not None
     ]
     shown = [
-        *((name.capitalize(), str(count)) for name, count in summary["counts"].items()),
+        *((name.capitalize(), str(count)) for name, count in summary["changes"].items()),
         *((f"Not compared, {day}", f"{ratio:.0%}") for day, ratio in ratios.items()),
         *run_figures(summary),
     ]
-    table = Table("What came and went", _HEAD, [*map(_row, things)], caption=_CAPTION)
-    sections = [Section("Changes", [table, *pictures]), run_section(summary)]
+    sections = [Section("Changes", [changes_table(objects), *pictures]), run_section(summary)]
     write_page(Page("What changed", f"{before} and {after}", shown, sections, summary), run)
 
 
-def write_things(path: Path, things: Sequence[Thing]) -> None:
-    """Write the table of things as CSV."""
-    rows = [dict(_flat(one.to_json())) for one in things]
+def changes_table(objects: Sequence[ChangedObject]) -> Table:
+    """Return the table of what changed; a row says if nothing did."""
+    rows = [*map(_row, objects)] or [("", "nothing", *[""] * (len(_HEAD) - 2))]
+    return Table("What came and went", _HEAD, rows, caption=_CAPTION)
+
+
+def write_objects(path: Path, objects: Sequence[ChangedObject]) -> None:
+    """Write the table of objects as CSV."""
+    rows = [dict(_flat(one.to_json())) for one in objects]
     write_text(path, csv_text([[*rows[0]] if rows else [], *([*row.values()] for row in rows)]))
 
 

@@ -19,6 +19,7 @@ from recon.export.make import Products
 from recon.io.atomic import write_bytes
 from recon.io.models.ply import write_ply
 from recon.look.rig import RefinedRig
+from recon.map.changes.compare import Comparison
 from recon.map.localize.localizer import State
 from recon.map.localize.sequence import LocalizedDrive, LocalizeResult
 from recon.map.store.map_file import MapFile
@@ -26,6 +27,7 @@ from recon.odometry.health import expected_drift
 from recon.odometry.protocol import OdometryHealth
 from recon.report import drive_figures as figures
 from recon.report import style
+from recon.report.changes_page import changes_table
 from recon.report.page import last_part, run_figures, run_section, write_page
 from recon.report.pair_page import stereo_blocks
 from recon.report.rig_part import rig_section
@@ -180,7 +182,9 @@ def path_errors(of: TrajectoryMetrics | None) -> list[Table]:
     return [Table("Path against truth", ("figure", "value"), rows)]
 
 
-def write_joined_page(map_: MapFile, made: Products, summary: Json, run: RunDirectory) -> None:
+def write_joined_page(
+    map_: MapFile, made: Products, summary: Json, run: RunDirectory, found: Comparison | None = None
+) -> None:
     """Write ``report.html`` of a map of several drives: all paths on one grid."""
     drives, links = summary["sessions"], summary["links"]
     paths = {f"session {number}": path for number, path in map_.paths.items()}
@@ -201,6 +205,7 @@ def write_joined_page(map_: MapFile, made: Products, summary: Json, run: RunDire
             Table("Sessions", [*columns], rows),
             Table("Places that two drives saw", ("drives", "places"), places, caption=note),
         ]),
+        *([] if found is None else [Section("What changed", [changes_table(found.objects)])]),
         run_section(summary),
     ]  # fmt: skip
     shown = [

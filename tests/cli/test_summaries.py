@@ -211,9 +211,10 @@ SUMMARIES: dict[str, Summary] = {
     ),
     "live": replace(MAP, read=LIVE),
     "merge": JOINED,
+    "merge with changes": replace(JOINED, changes={"came": 123, "went": 1}),
     "diff": DiffSummary(
-        before="outputs/monday", after="outputs/friday", counts={"came": 123, "went": 1},
-        not_compared_ratio={"before": 0.1, "after": 0.2}, things=(), T_map_world=np.eye(4), **COST,
+        before="outputs/monday", after="outputs/friday", changes={"came": 123, "went": 1},
+        not_compared_ratio={"before": 0.1, "after": 0.2}, objects=(), T_map_world=np.eye(4), **COST,
     ),
     "localize": LOCALIZED,
     "localize in another place": replace(

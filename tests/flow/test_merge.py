@@ -51,7 +51,7 @@ def runs(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def merged(runs):
-    options = MapOptions("merge", runs / "merged", mesh=False)
+    options = MapOptions("merge", runs / "merged", mesh=False, changes=True)
     run_merge([runs / name for name in ("first", "second", "elsewhere")], None, options)
     return runs / "merged"
 
@@ -73,6 +73,12 @@ def test_drives_that_share_places_are_linked_and_others_stay_apart(merged):
     off_m = np.linalg.norm(path.positions_m - true.positions_m[FIRST:], axis=1)
     assert off_m.max() < 0.3
     assert not (merged / "sessions/2").exists()
+
+
+def test_a_report_says_what_changed_where_it_is_asked_for(merged, run):
+    assert summary_of(merged)["changes"] == {"came": 0, "went": 0}  # of one street, at once
+    assert "What came and went" in (merged / "report.html").read_text(encoding="utf-8")
+    assert "changes" not in summary_of(run)
 
 
 def test_one_run_is_held_at_measured_positions(runs, tmp_path):
@@ -203,6 +209,7 @@ def test_a_wrong_merge_is_one_line(runs, tmp_path, second, message):
     ("map x --into RUN --out OTHER", "--into changes RUN"),
     ("map x --into RUN --remove 0", "maps no SOURCE"),
     ("map --remove 0", "--into"),
+    ("map x --changes", "--into RUN"),
     ("map --into RUN --remove 5", "no such session"),
     ("map --into RUN --remove 0", "only this session"),
     ("map --into RUN --remove 0 --end 3", "no effect here"),

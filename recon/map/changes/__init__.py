@@ -1,5 +1,5 @@
 """What came and what went between two sets of drives of one place.
 
 - `compare.py`: the surface of either set, by class: same, came or went, not compared;
-- `things.py`: what changed, in pieces: place, size, volume, and the frames that saw each.
+- `objects.py`: what changed, in pieces: place, size, volume, and the frames that saw each.
 """

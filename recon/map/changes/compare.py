@@ -23,7 +23,7 @@ from recon.core.errors import MappingError
 from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Float32, UInt8
 from recon.map.builders import FREE_MARGIN_SIGMAS, Submap
-from recon.map.changes.things import CAME, NOT_COMPARED, SAME, WENT, Day, Thing, things_of
+from recon.map.changes.objects import CAME, NOT_COMPARED, SAME, WENT, ChangedObject, Day, objects_of
 from recon.map.occupancy.bodies import FrameObservations
 from recon.map.occupancy.moving import find_moved
 from recon.map.sessions.copying import check_session, copy_sessions, same_drives
@@ -42,7 +42,11 @@ class Comparison:
 
     before: Day
     after: Day
-    things: Sequence[Thing]
+    objects: Sequence[ChangedObject]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {kind: sum(one.change == kind for one in self.objects) for kind in ("came", "went")}
 
 
 def gather(map_: MapFile, before: MapFile, after: MapFile) -> list[int]:
@@ -77,16 +81,13 @@ def compare(map_: MapFile, newer: Sequence[int], threads: int = 1) -> Comparison
     made, ends = placed.made(threads), np.cumsum([0, *placed.drives]).tolist()
     rows = {one.number: range(*ends[n : n + 2]) for n, one in enumerate(map_.linked)}
 
-    def seen_by(sessions: Sequence[Session]) -> FrameObservations:
-        return cast("FrameObservations", observations_of(map_, settings, sessions))  # all have rays
-
     def tiles_of(*drives: Sequence[Session]) -> Tiles:
         """Return tiles of groups of sessions, each of which counts as one drive, in that order."""
         sessions = [*chain(*drives)]
         chosen = _Chosen(made, [row for one in sessions for row in rows[one.number]])
         counts = [sum(len(rows[one.number]) for one in drive) for drive in drives]
         tiles = Tiles.of_submaps(chosen, settings, map_.first.T_map_world, drives=counts)
-        tiles.observations = seen_by(sessions)
+        tiles.observations = observations_of(map_, settings, sessions)
         return tiles
 
     days, sides = [], [[one for one in map_.linked if (one.number in newer) == n] for n in (0, 1)]
@@ -95,10 +96,11 @@ def compare(map_: MapFile, newer: Sequence[int], threads: int = 1) -> Comparison
         parts = [*_classified(own[n], own[1 - n], tiles_of(sides[n], sides[1 - n]), kind)]
         cloud = join_clouds(part for part, _ in parts)
         classes = np.concatenate([np.zeros(0, np.uint8), *(found for _, found in parts)])
-        days.append(Day(sides[n], seen_by(sides[n]), cloud, classes))
+        seen = cast("FrameObservations", own[n].observations)  # all have rays
+        days.append(Day(sides[n], seen, cloud, classes))
     before, after = days
-    found = [*things_of(before, after, WENT), *things_of(after, before, CAME)]
-    found.sort(key=lambda thing: -thing.points)
+    found = [*objects_of(before, after, WENT), *objects_of(after, before, CAME)]
+    found.sort(key=lambda changed: -changed.points)
     return Comparison(before, after, [replace(one, number=n) for n, one in enumerate(found, 1)])
 
 

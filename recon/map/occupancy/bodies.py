@@ -85,10 +85,12 @@ def dynamic_cells(keys: Int64, placed: Bool, observations: Iterable[Int8]) -> Bo
             ratios.append(np.divide(found, expected, out=out, where=np.asarray(expected > 0)))
         return np.asarray(np.hypot(*ratios) / np.sqrt(2.0))
 
-    # Cells whose points were not placed count where a piece has no others.
-    surely = disagreement(np.asarray(placed[pairs].all(axis=1)))
-    at_all = disagreement(np.ones(len(pairs), np.bool_))
-    ratio = np.where(np.isfinite(surely), surely, at_all)[piece]
+    # Cells whose points were not placed count where the others are too few to tell.
+    sure = np.asarray(placed[pairs].all(axis=1))
+    surely, at_all = disagreement(sure), disagreement(np.ones(len(pairs), np.bool_))
+    number = np.bincount(home[sure & upright], minlength=pieces)
+    told = np.abs(surely - _DISAGREEMENT) * np.sqrt(number) > surely  # by a standard error
+    ratio = np.where(told, surely, at_all)[piece]
     known = np.isfinite(ratio)
     body = known & (ratio <= _DISAGREEMENT)
     for _ in range(_GAPS):

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from recon.core.errors import RegistrationError
 from recon.core.geometry.alignment import fit_points, fit_upright
 from recon.core.geometry.se3 import apply, invert, orthonormalise
+from recon.core.progress import tracked
 from recon.core.values import Trajectory
 from recon.core.values.arrays import Float64
 from recon.map.store.map_file import MapFile, MapViews
@@ -186,7 +187,7 @@ def _between(map_: MapFile, group: Sequence[int], new: Session) -> list[Link]:
     known = KnownPlaces(views, new.scale)
     loops = [
         loop
-        for stored in (new.keyframes if len(known) else ())
+        for stored in (tracked(new.keyframes, "keyframes", "find places") if len(known) else ())
         if stored.keyframe.frame not in own
         for loop in known.recognise(stored.keyframe, new.camera).loops
         if views.keys[loop.first] not in theirs

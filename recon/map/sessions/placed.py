@@ -19,6 +19,7 @@ import numpy as np
 
 from recon.core.errors import FormatError, MappingError, SettingsError
 from recon.core.geometry.se3 import apply, invert
+from recon.core.progress import tracked
 from recon.core.values import RayCloud
 from recon.core.values.arrays import Bool, Float64
 from recon.core.work import side_by_side
@@ -157,7 +158,8 @@ class PlacedSubmaps:
     def made(self, threads: int) -> Submaps:
         """Make all, once, into a temporary store: they may be cut several times, and are slow."""
         made = Submaps(Store.temporary(cache_bytes=self._settings.memory.cache_bytes))
-        for submap in side_by_side(self.__getitem__, range(len(self)), threads=threads):
+        cast = side_by_side(self.__getitem__, range(len(self)), threads=threads)
+        for submap in tracked(cast, "submaps", "cast rays", total=len(self)):
             made.add(replace(submap, index=len(made), first_frame=made.frames))
         return made
 

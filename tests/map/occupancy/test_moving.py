@@ -392,6 +392,10 @@ def test_cells_that_frames_could_place_outweigh_the_others_of_their_piece():
     assert _judged(WALL, np.where(placed, BODY, noise), placed).all()
     assert not _judged(WALL, np.where(placed, noise, BODY), placed).any()
     assert _judged(WALL, BODY, np.zeros(len(WALL), np.bool_)).all()
+    # Three of them, which five frames saw differently, are too few.
+    few = (WALL[:, 0] == 3) & (WALL[:, 2] < 3)
+    differ = few & (WALL[:, 2] == 1) & (np.arange(LOOKS)[:, None] < 5)
+    assert _judged(WALL, np.where(differ, 1, BODY), few).all()
 
 
 def test_cells_of_which_too_little_is_known_belong_to_a_body_beside_them():

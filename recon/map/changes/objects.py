@@ -1,9 +1,10 @@
 """What came or went in pieces: where, how large, how much, and which frames saw it.
 
-Error alone changes cells anywhere, so those that changed alone say how frequent that is: with a
-frequency ``p``, chance makes ``n·(c·p)^(k-1)`` pieces of ``k`` cells from ``n`` such cells, if a
-cell can be joined in ``c`` ways (a bound of the number of lattice animals). Pieces are things from
-the size of which less than one in ten maps has one by chance.
+Error alone changes patches of cells anywhere: evidence is averaged over cells that touch, so those
+within 3 × 3 of a surface err together. Pieces that are no larger say how frequent that is: with a
+frequency ``p``, chance makes ``n·(c·p)^(k-1)`` pieces of ``k`` patches from ``n``, if a patch can
+be joined in ``c`` ways (a bound of the number of lattice animals). Pieces are objects from the size
+of which less than one in ten maps has one by chance.
 """
 
 from __future__ import annotations
@@ -11,28 +12,28 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
+from recon.core.dates import date_of_stamp
 from recon.core.kernels.voxels import pack_keys
+from recon.core.progress import tracked
 from recon.core.summary import Figures, hidden
 from recon.core.values import PointCloud
-from recon.core.values.arrays import Float64, Int64, UInt8
+from recon.core.values.arrays import Float32, Float64, Int64, UInt8
 from recon.map.occupancy.bodies import FrameObservations, pieces_of
 from recon.map.store.session import Session
 
 CLASSES: Final = ("same", "came", "went", "not compared")
 SAME, CAME, WENT, NOT_COMPARED = range(4)
 _GAP_CELLS: Final = 2.5  # between cells of a piece; those of a body have gaps of two
-_WAYS: Final = math.e * 24  # to join a cell: a surface has 24 others within such a gap
+_PATCH: Final = 9  # cells of a surface that err together
+_WAYS: Final = math.e * 8  # to join a patch: so many touch it
 _BY_CHANCE: Final = 0.1  # pieces in a map
-_FIRST_DATE_S: Final = 1e8  # stamps from here on, in 1973, are dates
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +53,17 @@ class Day:
 
 @dataclass(frozen=True)
 class Sighting(Figures):
-    """A frame that saw a thing; ``date_utc`` None = its stamp is no date."""
+    """A frame that saw an object; ``date`` is that of its drive where its stamp is none."""
 
     session: int
     drive: str
     frame: int
     time_s: float
-    date_utc: str | None
+    date: str  # UTC; "" = not known
 
 
 @dataclass(frozen=True, eq=False)
-class Thing(Figures):
+class ChangedObject(Figures):
     """Something that came or went; its box is in map axes, turned from x to y by its heading."""
 
     number: int
@@ -83,8 +84,8 @@ class Thing(Figures):
     picture: str | None = None  # None = no image of either day could be read
 
 
-def things_of(own: Day, other: Day, kind: int) -> list[Thing]:
-    """Return the things of a day among its points of the class ``CAME`` or ``WENT``."""
+def objects_of(own: Day, other: Day, kind: int) -> list[ChangedObject]:
+    """Return the objects of a day among its points of the class ``CAME`` or ``WENT``."""
     seen, cloud = own.observations, own.cloud.select(own.classes == kind)
     cell_m = seen.settings.resolution_m
     keys, home = np.unique(_cells(cloud.xyz, cell_m), return_inverse=True)
@@ -96,26 +97,27 @@ def things_of(own: Day, other: Day, kind: int) -> list[Thing]:
     piece = pieces_of(len(keys), pairs)
     sizes = np.bincount(piece)
     compared = len(np.unique(_cells(own.cloud.xyz[own.classes != NOT_COMPARED], cell_m)))
-    enough = sizes >= least_cells(int((sizes == 1).sum()), compared)
+    enough = sizes >= least_cells(int((sizes <= _PATCH).sum()), compared)
     hits = np.zeros((len(seen.frames), len(sizes)), np.int64)
-    for frame, look in seen.by_frame(keys):
+    for frame, look in tracked(seen.by_frame(keys), "frames", f"see what {CLASSES[kind]}"):
         hits[frame] = np.bincount(piece[look > 0], minlength=len(sizes))
     return [
-        _thing(own, other, cloud.select(piece[home] == one), hits[:, one], kind)
+        _object(own, other, cloud.select(piece[home] == one), hits[:, one], kind)
         for one in np.flatnonzero(enough & hits.any(axis=0)).tolist()
     ]
 
 
-def least_cells(alone: int, compared: int) -> int:
-    """Return how many cells a piece has that is no chance, where so many changed all alone."""
-    joined = _WAYS * max(alone, 1) / max(compared, 1)
+def least_cells(small: int, compared: int) -> int:
+    """Return how many cells a piece has that is no chance, where so many are small."""
+    small += 3  # so many may be expected where none was seen, at 95 %
+    joined = _WAYS * small * _PATCH / max(compared, 1)
     if joined >= 1:
         return compared + 1
-    return 1 + max(1, math.ceil(math.log(_BY_CHANCE / max(alone, 1)) / math.log(joined)))
+    return 1 + _PATCH * max(1, math.ceil(math.log(_BY_CHANCE / small) / math.log(joined)))
 
 
-def _thing(own: Day, other: Day, cloud: PointCloud, hits: Int64, kind: int) -> Thing:
-    """Return a thing by its points."""
+def _object(own: Day, other: Day, cloud: PointCloud, hits: Int64, kind: int) -> ChangedObject:
+    """Return an object by its points."""
     xyz, seen = cloud.xyz.astype(np.float64), np.flatnonzero(hits).tolist()
     rectangle = cv2.minAreaRect(np.ascontiguousarray(cloud.xyz[:, :2]))
     (x, y), (length, width), turn = rectangle
@@ -123,7 +125,7 @@ def _thing(own: Day, other: Day, cloud: PointCloud, hits: Int64, kind: int) -> T
         length, width, turn = width, length, turn + 90.0
     low, high = float(xyz[:, 2].min()), float(xyz[:, 2].max())
     plan = np.tile(cv2.boxPoints(rectangle), (2, 1))
-    return Thing(
+    return ChangedObject(
         0, CLASSES[kind], np.array([x, y, (low + high) / 2]), length, width, high - low,
         (turn + 90.0) % 180.0 - 90.0, *_volume(cloud, other.cloud, own.observations),
         len(cloud), _sighting(own, seen[0]), _sighting(own, seen[-1]),
@@ -134,9 +136,8 @@ def _thing(own: Day, other: Day, cloud: PointCloud, hits: Int64, kind: int) -> T
 def _sighting(day: Day, row: int) -> Sighting:
     number, frame = day.observations.frames[row]
     session = next(one for one in day.sessions if one.number == number)
-    time_s, date = float(session.trajectory.timestamps_s[frame]), None
-    if time_s >= _FIRST_DATE_S:
-        date = datetime.fromtimestamp(time_s, timezone.utc).isoformat(timespec="seconds")
+    time_s = float(session.trajectory.timestamps_s[frame])
+    date = date_of_stamp(time_s).text or session.date.text
     return Sighting(number, session.info.source, frame, time_s, date)
 
 
@@ -168,5 +169,5 @@ def _volume(
     return float(height_m @ covered) * cell_m**2, float(np.sqrt(variance.sum())) * cell_m**2
 
 
-def _cells(xyz: NDArray[np.floating[Any]], cell_m: float) -> Int64:
+def _cells(xyz: Float32, cell_m: float) -> Int64:
     return pack_keys(np.floor(xyz / cell_m).astype(np.int64))
