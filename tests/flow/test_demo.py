@@ -56,7 +56,7 @@ def test_path_map_and_occupancy_are_where_they_are(demo):
     assert 0.0 < summary["trajectory"]["t_rel_percent"] < 0.7
     assert 0.0 < summary["trajectory"]["ate_m"] < 0.15
     assert (summary["frames"], summary["frames_not_trusted"]) == (12, 0)
-    assert summary["map"]["f_score"] > 0.8
+    assert summary["map"]["f_score"] > 0.75  # of twelve frames
     assert 0.0 < summary["map"]["median_m"] < 0.1
     # A short drive; longer ones of several streets stand in test_export_run.py.
     found = summary["occupancy"]

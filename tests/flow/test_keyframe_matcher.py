@@ -56,7 +56,7 @@ def test_views_that_show_something_new_are_matched_again(drive, matched, tmp_pat
     # Odometry sees what it saw, and the map has more of it.
     path, same = run.mapped.trajectory.T_world_camera, plain.mapped.trajectory.T_world_camera
     assert np.array_equal(path, same)
-    assert run.summary.to_json()["points"] > plain.summary.to_json()["points"]
+    assert run.summary.to_json()["voxels"] > plain.summary.to_json()["voxels"]
 
 
 def test_a_car_that_stands_is_matched_again_once(drive, matched, tmp_path):
