@@ -343,17 +343,18 @@ def recordings(found: Found) -> Rows:
 
 
 def year(found: Found) -> Rows:
-    """What a map costs and finds at the begin and the end of a year, by what it keeps."""
+    """What a map costs and finds at the begin and after the last week, by what it keeps."""
     rows: Rows = {}
     for name, weeks in found["year"]["maps"].items():
         last = max(weeks, key=int)
-        before = weeks.get(str(int(last) - 1), {})
+        before = weeks[str(int(last) - 1)]
         rows[name] = {
-            "map after week 1": weeks["0"]["megabytes"],
-            "after week 52": weeks[last]["megabytes"],
-            "week 2 added in": weeks["1"].get("seconds"),
-            "week 52 in": weeks[last].get("seconds"),
-            "week 52 found at 3 cm": before.get("found_percent"),
+            "weeks": len(weeks),
+            "map after the first": weeks["0"]["megabytes"],
+            "after the last": weeks[last]["megabytes"],
+            "second added in": weeks["1"].get("seconds"),
+            "last in": weeks[last].get("seconds"),
+            "last found at 3 cm": before.get("found_percent"),
             "off": None if "off_m" not in before else 100 * before["off_m"],
         }
     return rows

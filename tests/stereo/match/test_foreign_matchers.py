@@ -254,7 +254,7 @@ def test_the_settings_that_a_plugin_brings_are_checked_shown_recorded_and_handed
 
 
 def test_settings_of_a_matcher_that_is_not_installed_are_refused_by_name():
-    with pytest.raises(SettingsError, match=r"unknown setting 'matching\.my_level'"):
+    with pytest.raises(SettingsError, match=r"unknown setting 'matching\.my_level\.level_px'"):
         load_config(None, ["matching.my_level.level_px=3"])
 
 
