@@ -17,12 +17,7 @@ import numpy as np
 from recon.commands.config import REMADE, ReconConfig, check_changes, run_settings
 from recon.commands.map import look_first, map_drive
 from recon.commands.map_options import MapOptions
-from recon.commands.map_summary import (
-    JoinedDrive,
-    JoinedSummary,
-    LinkFigures,
-    UsualProducts,
-)
+from recon.commands.map_summary import JoinedDrive, JoinedSummary, LinkFigures, UsualProducts
 from recon.core.errors import FormatError, ReconError, SettingsError
 from recon.export.make import make
 from recon.export.product import ExportContext

@@ -279,11 +279,9 @@ def _thin_submaps(seen: _Seen, cells: Int64 | None, keep: Keep) -> None:
     session, fusion = seen.session, seen.settings.fusion
     corrections = session.corrections()
     for number, submap in enumerate(session.submaps):
-        T = (
-            session.T_map_world
-            if corrections is None
-            else session.T_map_world @ corrections[number]
-        )
+        T = session.T_map_world
+        if corrections is not None:
+            T = T @ corrections[number]
         places_m = apply(T, submap.fused.points(fusion.voxel_m))
         kept = ~keep.outside(places_m)
         if cells is not None:
