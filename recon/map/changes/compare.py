@@ -99,6 +99,8 @@ def compare(map_: MapFile, newer: Sequence[int], threads: int = 1) -> Comparison
         seen = cast("FrameObservations", own[n].observations)  # all have rays
         days.append(Day(sides[n], seen, cloud, classes))
     before, after = days
+    if not (len(before.cloud) or len(after.cloud)):
+        raise MappingError("neither map has a point to compare", where=map_.store.name)
     found = [*objects_of(before, after, WENT), *objects_of(after, before, CAME)]
     found.sort(key=lambda changed: -changed.points)
     return Comparison(before, after, [replace(one, number=n) for n, one in enumerate(found, 1)])
