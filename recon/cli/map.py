@@ -301,12 +301,15 @@ def diff(
 
     Each may hold several drives. They are linked by places that both saw. Points
     of either day are the same, came, went, or could not be compared, since the
-    other day did not look there. Objects are listed with place, size, volume, when
-    they were seen, and a picture of both days.
+    other day did not look there. Objects are listed with place, size, volume,
+    when they were seen, and a picture of both days. The settings are those of the
+    first run.
 
     Examples:
       recon diff outputs/monday outputs/friday --out outputs/changes
     """
+    if shared.config is not None or shared.preset is not None or shared.changes:
+        raise typer.BadParameter("runs are compared as the first was mapped: no --config, --set")
     with shared.one_line_errors():
         from recon.commands.diff import run_diff
 
