@@ -22,7 +22,6 @@ from recon.odometry.kernels.patches import Placing, Surface, fit_slopes, place_p
 from recon.odometry.pose import REPROJECTION_PX, TrackWindow
 from recon.odometry.protocol import OdometryFrame
 from recon.stereo.match.sad import halve
-from recon.stereo.rectify.features import exposed_as
 
 MIN_DISPARITY_PX: Final = 0.5  # features with less disparity count as without depth
 
@@ -78,6 +77,13 @@ def observe_points(
     return uvd
 
 
+def told_apart(state: VisualState, one: Float64, other: Float64, camera: RectifiedCamera) -> Bool:
+    """The points (N,) seen last that two poses put too far apart to be found at the same place."""
+    xyz_world = state.window.xyz_world
+    apart = np.abs(_seen_from(one, xyz_world, camera) - _seen_from(other, xyz_world, camera))
+    return np.asarray(state.window.seen[-1] & ~(apart.max(axis=1) <= _PLACING.reach))
+
+
 def known_disparity(disparity: Disparity, camera: RectifiedCamera, uv: Float32) -> Float64:
     """Return the disparity (N,) of features; NaN = unknown, or too small to give a depth."""
     d = _sampled(disparity, uv).astype(np.float64)
@@ -113,10 +119,6 @@ def _seen_from(T_world_camera: Float64, xyz_world: Float64, camera: RectifiedCam
 
 _WINDOW_PX: Final = 17  # edge of the tracked patch
 _LEVELS: Final = 3  # pyramid levels above full resolution
-_MAX_EXPOSURE_CHANGE: Final = 0.05
-"""Relative change of brightness or contrast above which an image is adapted to the exposure of the
-last one before tracking."""
-
 _NEIGHBOUR_PX: Final = 2  # half width of the neighbourhood whose median is the disparity
 _MAX_DISPARITY_STEP_PX: Final = 1.0  # largest difference between a disparity and that median
 _MIN_EIGENVALUE: Final = 1e-4  # least texture of a patch that is tracked, OpenCV's scale
@@ -132,9 +134,7 @@ def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tupl
     """
     if not len(uv):
         return uv.copy(), np.zeros(0, np.bool_)
-    ours, theirs = (np.ravel(cv2.meanStdDev(image)) for image in (source, target))
-    if (np.abs(theirs - ours) > _MAX_EXPOSURE_CHANGE * ours).any():
-        target = exposed_as(source, target)
+    source, target = _evened(source), _evened(target)
     end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.05)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         source,
@@ -151,6 +151,15 @@ def follow(source: UInt8, target: UInt8, uv: Float32, guess_uv: Float32) -> tupl
     height, width = target.shape
     inside = (there >= 0).all(axis=1) & (there[:, 0] <= width - 1) & (there[:, 1] <= height - 1)
     return there, np.asarray(found & inside)
+
+
+def _evened(grey: UInt8) -> UInt8:
+    """An image over its mean around each pixel, 128 = as bright: whatever the light is there.
+
+    Else patches on an edge slide along it to where it is as bright: all alike, as by a motion.
+    """
+    mean = cv2.boxFilter(grey, cv2.CV_32F, (2 * _WINDOW_PX - 1, 2 * _WINDOW_PX - 1))
+    return np.asarray(cv2.divide(grey, cv2.max(mean, 1.0), scale=128.0, dtype=cv2.CV_8U))
 
 
 def _sampled(disparity: Disparity, uv: Float32) -> Float32:

@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from recon.core.geometry.se3 import Motion, covariance_of, distance_in_sigmas
+from recon.core.geometry.se3 import Motion, as_step, covariance_of, distance_in_sigmas, invert
 from recon.core.text import counted
 from recon.core.values import Disparity, RectifiedCamera
-from recon.core.values.arrays import Float64, tree_of
+from recon.core.values.arrays import Bool, Float64, tree_of
 from recon.odometry.checked import most_sigma_m
 from recon.odometry.features import (
     VisualState,
@@ -20,9 +20,11 @@ from recon.odometry.features import (
     observe_points,
     points_of,
     replenish,
+    told_apart,
 )
 from recon.odometry.guide import MAX_SIGMAS, Guide, Guided
 from recon.odometry.pose import (
+    INDEPENDENCE,
     MIN_INLIERS,
     KnownPose,
     LocatedCamera,
@@ -39,6 +41,7 @@ from recon.stereo.rectify.features import match_features
 
 _FRAMES: Final = 6  # frames adjusted together
 _RELOCATE_FEATURES: Final = 2000  # features matched over the whole image where tracking fails
+_SIGMAS: Final = 2.0  # by which tracks for one of two motions outnumber those for the other
 _NOTHING: Final = "nothing to follow in the image"
 
 
@@ -60,6 +63,7 @@ class _Seen:
     window: TrackWindow
     tracks: int
     note: str = ""
+    rival: Float64 | None = None  # (4, 4), another pose that explains the image about as well
 
     @property
     def inliers(self) -> int:
@@ -112,6 +116,9 @@ class VisualOdometry:
         camera, known = frame.pair.camera, _held(expected)
         health = newest_health(seen.window, camera, seen.tracks, seen.note, known)
         information = newest_information(seen.window, camera, known=known)
+        if seen.rival is not None:
+            off = as_step(invert(T_world_camera) @ seen.rival)
+            health, information = _doubted(health, information, off)
         return VisualEstimate(OdometryResult(T_world_camera, health), information)
 
     @property
@@ -176,18 +183,34 @@ class VisualOdometry:
         """The frame, registered by tracking; None = that fails.
 
         The features that are followed give a pose, and the pose says where all of them are and how
-        they look from there: those that were lost are found, and the others more closely.
+        they look from there: those that were lost are found, and the others more closely. They may
+        have slid: if the points that do not agree could tell, the expected motion is tried, too.
         """
-        window = state.window
+        window, camera = state.window, frame.pair.camera
         uv = follow_points(state, frame, expected.T_world_camera)
         tracks = np.flatnonzero(np.isfinite(uv[:, 0]))
-        rough = _locate(window.xyz_world[tracks], uv[tracks], frame.pair.camera, expected)
+        rough = _locate(window.xyz_world[tracks], uv[tracks], camera, expected)
         if rough is None:
             return None
-        uvd = observe_points(state, frame, uv, rough.T_world_camera)
+        seen = self._observed(state, frame, uv, rough.T_world_camera, expected)
+        if seen is None:
+            return None
+        agree = seen.window.seen[-1]
+        apart = told_apart(state, rough.T_world_camera, expected.T_world_camera, camera)
+        if apart.sum() < MIN_INLIERS or _more(apart & agree, window.seen[-1] & ~agree):
+            return seen
+        nowhere = np.full_like(uv, np.nan)
+        rival = self._observed(state, frame, nowhere, expected.T_world_camera, expected)
+        return seen if rival is None else _better(seen, rival)
+
+    def _observed(
+        self, state: VisualState, frame: OdometryFrame, uv: Float64, T: Float64, expected: Guided
+    ) -> _Seen | None:
+        """The frame, registered by what is seen from a rough pose; None = too little agrees."""
+        uvd = observe_points(state, frame, uv, T)
         if not expected.holds:
-            expected = replace(expected, T_world_camera=rough.T_world_camera)
-        seen = self._register(window, uvd, frame, expected)
+            expected = replace(expected, T_world_camera=T)
+        seen = self._register(state.window, uvd, frame, expected)
         # Patches drift along edges together: of them, a few that agree with a turn may be wrong.
         return seen if seen is not None and enough_agree(seen.inliers, seen.tracks) else None
 
@@ -284,6 +307,35 @@ def _locate(
     if held is None or alone is None:
         return held or alone
     return max(held, alone, key=lambda found: int(found.agree.sum()))
+
+
+def _better(one: _Seen, other: _Seen) -> _Seen:
+    """The motion that more tracks agree with; the other is its rival if that may be chance."""
+    best, less = (one, other) if one.inliers >= other.inliers else (other, one)
+    ours, theirs = best.window.seen[-1], less.window.seen[-1]
+    clear = _more(ours & ~theirs, theirs & ~ours)
+    return best if clear else replace(best, rival=less.window.T_world_camera[-1])
+
+
+def _more(for_one: Bool, for_other: Bool) -> bool:
+    """Whether so many more tracks (N,) are for one of two motions that it is no chance."""
+    one, other = np.count_nonzero(for_one), np.count_nonzero(for_other)
+    return bool(np.sqrt(INDEPENDENCE) * (one - other) > _SIGMAS * np.sqrt(one + other))
+
+
+def _doubted(
+    health: OdometryHealth, information: Float64, off: Float64
+) -> tuple[OdometryHealth, Float64]:
+    """Health and information of a pose where one that is ``off`` (6,) from it is as likely."""
+    covariance = covariance_of(information)
+    if distance_in_sigmas(off, covariance) <= MAX_SIGMAS:
+        return health, information
+    half = off / 2.0  # that each is off their mean
+    sigma_m = float(np.hypot(health.sigma_m, np.linalg.norm(half[:3])))
+    sigma_deg = float(np.hypot(health.sigma_deg, np.rad2deg(np.linalg.norm(half[3:]))))
+    notes = (*health.notes, "another motion explains the image as well")
+    health = replace(health, sigma_m=sigma_m, sigma_deg=sigma_deg, notes=notes)
+    return health, np.asarray(np.linalg.inv(covariance + np.outer(half, half)))
 
 
 def _held(expected: Guided) -> KnownPose | None:

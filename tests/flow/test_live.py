@@ -88,13 +88,19 @@ def play(tmp_path, watch):
     return play_drive
 
 
-def test_a_drive_that_is_kept_up_with_gives_the_same_map(street, mapped, patient, play, tmp_path):
+def test_a_drive_that_is_kept_up_with_gives_the_same_map(
+    street, mapped, patient, play, watch, tmp_path
+):
     """But for the poses, which rest on features alone."""
     summary, usual = play(street), summary_of(mapped)
     assert summary["points"] == pytest.approx(usual["points"], rel=0.05)
     assert summary["odometry"] == "visual"
     found_m = read_tum(tmp_path / "live" / "trajectory_tum.txt").positions_m
-    assert np.linalg.norm(found_m - street.trajectory.positions_m, axis=1).max() < 0.1
+    off_m = np.linalg.norm(found_m - street.trajectory.positions_m, axis=1)
+    # Steps are independent, and none of so few is off by more than four of its sigmas.
+    sigma_m = np.sqrt(np.cumsum([step.health.sigma_m**2 for step in watch.steps[1:]]))
+    assert (off_m[1:] < 4 * sigma_m).all()
+    assert np.median(off_m) < 0.1
     assert summary["live"]["frames_arrived"] == 8
     assert summary["live"]["frames_dropped"] == summary["live"]["frames_not_matched"] == 0
     latency_ms = summary["live"]["latency_ms"]
