@@ -44,9 +44,7 @@ class ErrorFigures(Figures):
 
     @classmethod
     def of(cls, off_m: ArrayLike, survey_m: float = 0.0) -> Self | None:
-        """Return the figures of differences (N, 3); None of none.
-
-        The standard deviation of a surveyed coordinate is added to each error.
+        """Return those of differences (N, 3), with that of the survey in each; None of none.
 
         Ref: ASPRS Positional Accuracy Standards for Digital Geospatial Data, edition 2, 2023.
         """
@@ -170,7 +168,7 @@ def _seen_ground(context: ExportContext) -> dict[str, Float64]:
     keyframes = {one.number: {*one.keyframes.frames} for one in context.map.linked}
     gsd_m, frames, overlaps = np.full(len(keys), np.nan), np.zeros(len(keys)), [np.nan]
     before = dict.fromkeys(keyframes, np.zeros(len(keys), np.bool_))
-    for number, look in tracked(looks.by_frame(keys), "frames", "measure the ground"):
+    for number, look in tracked(looks.by_frame(keys), "frames", "ground"):
         hit, (drive, frame) = look > 0, looks.frames[number]
         depth_m = apply(invert(looks.T_map_camera[number]), places_m[hit])[:, 2]
         gsd_m[hit] = np.fmin(gsd_m[hit], depth_m / focal_px[drive])

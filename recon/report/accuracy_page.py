@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -10,16 +9,14 @@ import numpy as np
 
 from recon.core.text import counted, metres
 from recon.core.values.arrays import Float64
-from recon.export.accuracy import AccuracyFigures, ErrorFigures
-from recon.map.sessions.georeference import ControlFigures
+from recon.export.accuracy import AccuracyFigures
 from recon.report import style
 from recon.report.page import write_page
-from recon.report.sections import NOT_KNOWN, Image, Page, Section, Table, known
+from recon.report.sections import Image, Page, Section, Table, known, row_of
 from recon.run.directory import RunDirectory
 
-_HEAD: Final = (
-    "", "east", "north", "up", "horizontal", "3d", "σ east", "σ north", "σ up", "images", "note",
-)  # fmt: skip
+_AXES: Final = ("east", "north", "up")
+_HEAD: Final = ("", *_AXES, *(f"σ {axis}" for axis in _AXES), "images", "note")
 _SPREADS: Final = {
     "sigma_m": ("standard deviation of a place (m)", "{:.3f}"),
     "gsd_m": ("ground sampling distance (m)", "{:.4f}"),
@@ -27,78 +24,70 @@ _SPREADS: Final = {
     "keyframe_overlap": ("ground of a keyframe that the next one saw", "{:.0%}"),
 }
 _CELLS: Final = 160  # of the sigma map, across
+Json = Mapping[str, Any]
 
 
-def write_accuracy_page(found: AccuracyFigures, places: Float64, run: RunDirectory) -> None:
+def write_accuracy_page(figures: AccuracyFigures, places: Float64, run: RunDirectory) -> None:
     """Write ``accuracy.html``; ``places`` are those of `measure_accuracy`."""
-    points = (found.survey.control or {}).items()
-    check, control = ({n: one for n, one in points if one.check == kind} for kind in (True, False))
+    found = figures.to_json()
+    kinds = {"Check points": "check", "Control points": "control", "Path": "path"}
+    shown = [
+        (f"{name}, RMSE {axis}", metres(of["rmse_m"][axis]))
+        for name, of in ((name, found[key]) for name, key in kinds.items())
+        if of
+        for axis in ("horizontal", "up", "3d")
+    ]
     spreads = [
-        (name, *map(form.format, found.spreads[key].values()))
+        row_of(name, found["spreads"][key], [(form, of) for of in ("median", "p5", "p95")])
         for key, (name, form) in _SPREADS.items()
-        if key in found.spreads
+        if key in found["spreads"]
     ]
-    drives = [
-        (key.replace("_", " "), *(_text(one[key]) for one in found.drives))
-        for key in found.drives[0]
+    drives = found["drives"]
+    of_drives = [
+        (key.replace("_", " "), *(known("{:.7g}", one[key], str(one[key])) for one in drives))
+        for key in drives[0]
     ]
-    files = {"Products": found.products_sha256, "Made of": found.inputs_sha256}
     sections = [
-        Section("Errors", [
-            _errors("Check points", check, found.check, found.tested),
-            _errors("Control points, which place the map", control, found.control),
-            _errors("Positions along the path, which place the map", {}, found.path),
-        ], f"Map minus survey, in metres; σ is what was expected. Coordinates of points are taken "
-           f"as surveyed to {found.surveyed_m:g} m."),
+        Section("Errors", [_errors(name, found, key) for name, key in kinds.items()],
+                f"Map minus survey, in metres; σ is what was expected. Points are taken as "
+                f"surveyed to {figures.surveyed_m:g} m. Check points place nothing."),
         Section("Map and images", [
             Image("Standard deviation of places", _sigma_map(places),
                   "Seen from above: of all three coordinates together, by the points and by how "
                   "well the map is placed, but without the drift of its path."),
             Table("Seen", ("figure", "median", "5 %", "95 %"), spreads),
-            Table("Drives", (), drives),
+            Table("Drives", (), of_drives),
         ]),
-        Section("Files", [Table(title, (), [(digest, name) for name, digest in one.items()])
-                          for title, one in files.items()],
-                "The page is about these files alone: sha256sum says whether a file is one."),
+        Section("Files", [
+            Table(f"SHA-256 of {key}", (), [(digest, name) for name, digest in files.items()])
+            for key, files in (("products", figures.products_sha256),
+                               ("what they were made of", figures.inputs_sha256))
+        ], "The page is about these files alone: sha256sum says whether a file is one."),
     ]  # fmt: skip
-    kinds = {"Check points": found.check, "Control points": found.control, "Path": found.path}
-    shown = [
-        (f"{name}, RMSE {axis}", metres(one.rmse_m[axis]))
-        for name, one in kinds.items()
-        if one is not None
-        for axis in ("horizontal", "up", "3d")
-    ]
-    placed = counted(found.survey.positions, "position" if found.path else "control point")
-    where = f"{found.system or 'unknown coordinate system'}, placed by {placed}"
-    subtitle = f"{where}. {found.statement} {found.made_utc}"
-    page = Page("Accuracy", subtitle, shown, sections, {}, found.warnings)
+    by = counted(figures.survey.positions, "position" if figures.path else "control point")
+    where = f"{figures.system or 'unknown coordinate system'}, placed by {by}"
+    subtitle = f"{where}. {figures.statement} {figures.made_utc}"
+    page = Page("Accuracy", subtitle, shown, sections, {}, figures.warnings)
     write_page(page, run, "accuracy.html")
 
 
-def _errors(
-    title: str,
-    points: Mapping[str, ControlFigures],
-    of: ErrorFigures | None,
-    tested: ErrorFigures | None = None,
-) -> Table:
-    """Return the table of points and of their errors; points that have a note are marked."""
-    rows = []
-    for name, one in points.items():
-        off = (one.east_m, one.north_m, one.up_m)
-        sigma = (one.sigma_east_m, one.sigma_north_m, one.sigma_up_m)
-        numbers = (*off, math.hypot(*off[:2]), math.hypot(*off), *sigma)
-        rows.append((name, *map(_text, numbers), ", ".join(one.images), one.note))
-    means = {} if of is None else {f"mean of {of.points}": of.mean_m, "RMSE": of.rmse_m}
-    if tested is not None:
-        means["RMSE with that of the survey"] = tested.rmse_m
-    for name, each in means.items():
-        rows.append((name, *map(_text, each.values()), *[""] * (len(_HEAD) - len(each) - 1)))
-    return Table(title, _HEAD, rows, bad=[name for name, one in points.items() if one.note])
-
-
-def _text(value: Any) -> str:
-    number = value is None or isinstance(value, float)
-    return known("{:.3f}", value, NOT_KNOWN) if number else str(value)
+def _errors(title: str, found: Json, key: str) -> Table:
+    """Return the table of points of one kind and of their errors; those with a note are marked."""
+    listed, kind = found["survey"].get("control") or {}, {"check": True, "control": False}.get(key)
+    points = {name: one for name, one in listed.items() if one["check"] == kind}
+    columns = [("{:.3f}", f"{of}{axis}_m") for of in ("", "sigma_") for axis in _AXES]
+    rows = [
+        (*row_of(name, one, columns), ", ".join(one["images"]), one["note"])
+        for name, one in points.items()
+    ]
+    errors = {"mean": (key, "mean_m"), "RMSE": (key, "rmse_m")}
+    if kind:
+        errors["RMSE with that of the survey"] = ("tested", "rmse_m")
+    for name, (of, part) in errors.items() if found[key] else ():
+        row = row_of(name, found[of][part], [("{:.3f}", axis) for axis in _AXES])
+        both = (f"{x} {m:.3f}" for x, m in found[of][part].items() if x not in _AXES)
+        rows.append((*row, "", "", "", "", ", ".join(both)))
+    return Table(title, _HEAD, rows, bad=[name for name, one in points.items() if one["note"]])
 
 
 @style.styled

@@ -292,7 +292,7 @@ def test_positions_along_the_drive_are_no_check_and_the_report_says_so(small_dem
     assert 0.01 < found["path"]["rmse_m"]["3d"] < 0.06
     assert found["path"]["rmse_m"]["3d"] == pytest.approx(found["survey"]["misfit_rms_m"])
     page = (tmp_path / "out/accuracy.html").read_text()
-    assert "Positions along the path, which place the map" in page
+    assert "Path, RMSE horizontal" in page
     assert "http" not in page.replace("http-equiv", "")
 
 
