@@ -31,7 +31,7 @@ from recon.stereo.rectify.rectifier import turns_of
 _FEWEST: Final = 3
 _CLICK_PX: Final = 1.0  # standard deviation of a pixel that a person has chosen
 SURVEYED_M: Final = 0.02  # of a coordinate, by a receiver with corrections
-_MOST_SIGMAS: Final = 3.0  # by which a check point may be off without a word
+_MOST_SIGMAS: Final = 3.0  # by which a coordinate may be off without a word
 _NOWHERE: Final = (np.full(3, np.nan), np.eye(3))
 
 
@@ -114,7 +114,7 @@ def _compared(
     notes = {
         "has no depth where it is seen: left out": np.isnan(times),
         f"contradicts the others: {apart} off, left out": not (used or point.check),
-        f"is {apart} off, {times:.1f} times its standard deviation": times > _MOST_SIGMAS,
+        f"is {apart} off, {times:.1f} standard deviations in a coordinate": times > _MOST_SIGMAS,
     }
     note = next((text for text, holds in notes.items() if holds), "")
     (e, n, u), (sigma_e, sigma_n, sigma_u, worst) = off_m.tolist(), sigma_m.tolist()

@@ -80,12 +80,12 @@ def _errors(title: str, found: Json, key: str) -> Table:
         (*row_of(name, one, columns), ", ".join(one["images"]), one["note"])
         for name, one in points.items()
     ]
-    errors = {"mean": (key, "mean_m"), "RMSE": (key, "rmse_m")}
-    if kind:
-        errors["RMSE with that of the survey"] = ("tested", "rmse_m")
-    for name, (of, part) in errors.items() if found[key] else ():
-        row = row_of(name, found[of][part], [("{:.3f}", axis) for axis in _AXES])
-        both = (f"{x} {m:.3f}" for x, m in found[of][part].items() if x not in _AXES)
+    of, tested = found[key], found["tested"] if kind else None
+    errors = {} if of is None else {f"mean of {of['points']}": of["mean_m"], "RMSE": of["rmse_m"]}
+    errors |= {} if tested is None else {"RMSE with that of the survey": tested["rmse_m"]}
+    for name, one in errors.items():
+        both = (f"{axis} {error_m:.3f}" for axis, error_m in one.items() if axis not in _AXES)
+        row = row_of(name, one, [("{:.3f}", axis) for axis in _AXES])
         rows.append((*row, "", "", "", "", ", ".join(both)))
     return Table(title, _HEAD, rows, bad=[name for name, one in points.items() if one["note"]])
 

@@ -6,6 +6,7 @@ import pytest
 from recon.core.geometry.se3 import apply, exp_so3, make_transform
 from recon.export.accuracy import ErrorFigures, _statement
 from recon.map.sessions.georeference import Georeference
+from recon.map.sessions.measured import Survey
 
 OFF_M = np.array([[0.03, -0.04, 0.1], [-0.01, 0.02, -0.3], [0.05, 0.0, 0.05]])
 
@@ -67,3 +68,17 @@ def test_places_are_as_uncertain_as_turns_and_shifts_of_the_map_make_them():
     found = placed.covariance(place_m[None])[0]
     np.testing.assert_allclose(found, expected, atol=0.07 * np.trace(expected))
     np.testing.assert_allclose(placed.covariance(middle_m[None])[0], 0.01 * np.eye(3), atol=1e-12)
+
+
+def test_the_files_of_a_survey_are_those_that_it_is_read_from(tmp_path):
+    oxts = tmp_path / "oxts"
+    (oxts / "data").mkdir(parents=True)
+    for name in ("data/0.txt", "timestamps.txt"):
+        (oxts / name).write_text(name)
+    (tmp_path / "drive.bag").write_text("bag")
+    assert Survey(oxts).files == {
+        "oxts/data/0.txt": oxts / "data/0.txt",
+        "oxts/timestamps.txt": oxts / "timestamps.txt",
+    }
+    topic = Survey(tmp_path / "drive.bag:/fix")
+    assert topic.files == {"drive.bag": tmp_path / "drive.bag"}

@@ -227,7 +227,7 @@ def test_a_check_point_places_nothing_and_a_bad_one_is_seen_at_once(checked):
     apart = [after[key] - before[key] for key in ("east_m", "north_m", "up_m")]
     np.testing.assert_allclose(apart, [-0.5, 0.3, -0.8], atol=2e-4)
     assert not before["note"]
-    assert "times its standard deviation" in after["note"]
+    assert "standard deviations in a coordinate" in after["note"]
     (said,) = [line for line in summary["warnings"] if "check point" in line]
     assert said == f"check point {name} {after['note']}"
     assert moved["warnings"] == [said]
