@@ -116,9 +116,11 @@ def run_export(
         made = make(context, run.content, wanted, run.watch)
         if there is not None and survey is not None:
             with run.stage("accuracy"):
-                written = {name: run.path(name) for name in run.files()}
-                inputs = {str(MAP_FILE): source / MAP_FILE, **survey.files}
-                accuracy, places = measure_accuracy(context, there, inputs, written)
+                files = {
+                    "products": {name: run.path(name) for name in run.files()},
+                    "inputs": {str(MAP_FILE): source / MAP_FILE, **survey.files},
+                }
+                accuracy, places = measure_accuracy(context, there, files)
                 run.write_json("accuracy.json", accuracy.to_json())
                 write_accuracy_page(accuracy, places, run)
         doubts, T_map_world = map_.doubts, map_.first.T_map_world

@@ -43,15 +43,13 @@ class ErrorFigures(Figures):
     rmse_m: Mapping[str, float]  # those, ``horizontal`` (both together) and ``3d``
 
     @classmethod
-    def of(cls, off_m: ArrayLike, survey_m: float = 0.0) -> Self | None:
-        """Return those of differences (N, 3), with that of the survey in each; None of none.
+    def of(cls, off_m: ArrayLike, survey_m: float = 0.0) -> Self:
+        """Return those of differences (N, 3), with the error of the survey in each coordinate.
 
         Ref: ASPRS Positional Accuracy Standards for Digital Geospatial Data, edition 2, 2023.
         """
-        off = np.asarray(off_m, np.float64).reshape(-1, 3)
-        if not len(off):
-            return None
-        names, square = ("east", "north", "up"), np.mean(off**2, axis=0) + survey_m**2
+        off, names = np.asarray(off_m, np.float64), ("east", "north", "up")
+        square = np.mean(off**2, axis=0) + survey_m**2
         rmse_m = np.sqrt([*square, square[:2].sum(), square.sum()]).tolist()
         rmse = dict(zip((*names, "horizontal", "3d"), rmse_m, strict=True))
         return cls(len(off), dict(zip(names, off.mean(axis=0).tolist(), strict=True)), rmse)
@@ -59,33 +57,29 @@ class ErrorFigures(Figures):
 
 @dataclass(frozen=True, kw_only=True)
 class AccuracyFigures(Figures):
-    """What ``accuracy.json`` has; None = there are no such points."""
+    """What ``accuracy.json`` has."""
 
     made_utc: str
     system: str | None  # the coordinate system; None = not known
     statement: str
-    check: ErrorFigures | None  # of check points, by which nothing is placed
-    tested: ErrorFigures | None  # the same with the error of their survey, as ASPRS asks for
-    control: ErrorFigures | None  # of the control points that place the map
-    path: ErrorFigures | None  # of the positions along the drive that place it
+    # Of ``check`` points, by which nothing is placed; ``tested``: of these with the error of their
+    # survey, as ASPRS asks for; of ``control`` points or a ``path``, which place the map.
+    errors: Mapping[str, ErrorFigures]
     surveyed_m: float  # standard deviation of a coordinate of a point, which is assumed
     survey: SurveyFigures
     spreads: Mapping[str, Spread]  # of what `measure_accuracy` says, as far as it is known
     drives: Sequence[Mapping[str, Any]]
     versions: Mapping[str, str]
-    inputs_sha256: Mapping[str, str]
-    products_sha256: Mapping[str, str]
+    sha256: Mapping[str, Mapping[str, str]]  # of files by their names
     warnings: Sequence[str]
 
 
 def measure_accuracy(
-    context: ExportContext,
-    placed: Georeference,
-    inputs: Mapping[str, Path],
-    products: Mapping[str, Path],
+    context: ExportContext, placed: Georeference, files: Mapping[str, Mapping[str, Path]]
 ) -> tuple[AccuracyFigures, Float64]:
     """Measure how accurate a map is by its survey, and hash the files of which that is said.
 
+    ``files`` are ``inputs`` and ``products``, by the names under which they are to be found.
     Spreads are of the standard deviation of a place of the cloud (all three coordinates together),
     and of what rays show of the ground: what a pixel is wide there in the nearest frame, how many
     frames saw it, and the fraction of what a keyframe saw that the next one saw, too.
@@ -97,31 +91,32 @@ def measure_accuracy(
     xyz = apply(placed.T_survey_map, cloud.xyz.astype(np.float64))
     own_m = np.nan if cloud.sigma_m is None else cloud.sigma_m
     sigma_m = np.sqrt(own_m**2 + np.trace(placed.covariance(xyz), axis1=1, axis2=2))
-    checked = [_OFF(one) for one in points if one.check and np.isfinite(one.east_m)]
-    tested = ErrorFigures.of(checked, SURVEYED_M)
+    off_m: dict[str, Sequence[Any]] = {
+        "check": [_OFF(one) for one in points if one.check and np.isfinite(one.east_m)],
+        "control": [_OFF(one) for one in points if one.used],
+        "path": () if points else placed.off_m.tolist(),
+    }
+    errors = {name: ErrorFigures.of(some) for name, some in off_m.items() if some}
+    if "check" in errors:
+        errors["tested"] = ErrorFigures.of(off_m["check"], SURVEYED_M)
     values = {"sigma_m": sigma_m, **_seen_ground(context)}
     figures = AccuracyFigures(
         made_utc=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         system=placed.system,
-        statement=_statement(tested),
-        check=ErrorFigures.of(checked),
-        tested=tested,
-        control=ErrorFigures.of([_OFF(one) for one in points if one.used]),
-        path=None if points else ErrorFigures.of(placed.off_m),
+        statement=_statement(errors.get("tested")),
+        errors=errors,
         surveyed_m=SURVEYED_M,
         survey=placed.figures(),
         spreads={name: _spread(some) for name, some in values.items() if np.isfinite(some).any()},
         drives=[_drive(session, context) for session in context.map.linked],
         versions=versions(),
-        inputs_sha256=_hashed(inputs),
-        products_sha256=_hashed(products),
+        sha256={
+            kind: {name: digest_of(path) for name, path in tracked([*some.items()], "files")}
+            for kind, some in files.items()
+        },
         warnings=placed.warnings(),
     )
     return figures, np.column_stack([xyz, sigma_m])
-
-
-def _hashed(files: Mapping[str, Path]) -> dict[str, str]:
-    return {name: digest_of(path) for name, path in tracked([*files.items()], "files", "hash")}
 
 
 def _statement(tested: ErrorFigures | None) -> str:

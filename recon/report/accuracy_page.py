@@ -30,11 +30,11 @@ Json = Mapping[str, Any]
 def write_accuracy_page(figures: AccuracyFigures, places: Float64, run: RunDirectory) -> None:
     """Write ``accuracy.html``; ``places`` are those of `measure_accuracy`."""
     found = figures.to_json()
-    kinds = {"Check points": "check", "Control points": "control", "Path": "path"}
+    kinds = {"check": "Check points", "control": "Control points", "path": "Path"}
     shown = [
-        (f"{name}, RMSE {axis}", metres(of["rmse_m"][axis]))
-        for name, of in ((name, found[key]) for name, key in kinds.items())
-        if of
+        (f"{name}, RMSE {axis}", metres(figures.errors[key].rmse_m[axis]))
+        for key, name in kinds.items()
+        if key in figures.errors
         for axis in ("horizontal", "up", "3d")
     ]
     spreads = [
@@ -48,7 +48,7 @@ def write_accuracy_page(figures: AccuracyFigures, places: Float64, run: RunDirec
         for key in drives[0]
     ]
     sections = [
-        Section("Errors", [_errors(name, found, key) for name, key in kinds.items()],
+        Section("Errors", [_errors(name, found, key) for key, name in kinds.items()],
                 f"Map minus survey, in metres; σ is what was expected. Points are taken as "
                 f"surveyed to {figures.surveyed_m:g} m. Check points place nothing."),
         Section("Map and images", [
@@ -59,12 +59,13 @@ def write_accuracy_page(figures: AccuracyFigures, places: Float64, run: RunDirec
             Table("Drives", (), of_drives),
         ]),
         Section("Files", [
-            Table(f"SHA-256 of {key}", (), [(digest, name) for name, digest in files.items()])
-            for key, files in (("products", figures.products_sha256),
-                               ("what they were made of", figures.inputs_sha256))
+            Table(f"SHA-256 of {kind}", (), [(digest, name) for name, digest in files.items()])
+            for kind, files in figures.sha256.items()
         ], "The page is about these files alone: sha256sum says whether a file is one."),
     ]  # fmt: skip
-    by = counted(figures.survey.positions, "position" if figures.path else "control point")
+    by = counted(
+        figures.survey.positions, "position" if "path" in figures.errors else "control point"
+    )
     where = f"{figures.system or 'unknown coordinate system'}, placed by {by}"
     subtitle = f"{where}. {figures.statement} {figures.made_utc}"
     page = Page("Accuracy", subtitle, shown, sections, {}, figures.warnings)
@@ -80,9 +81,11 @@ def _errors(title: str, found: Json, key: str) -> Table:
         (*row_of(name, one, columns), ", ".join(one["images"]), one["note"])
         for name, one in points.items()
     ]
-    of, tested = found[key], found["tested"] if kind else None
-    errors = {} if of is None else {f"mean of {of['points']}": of["mean_m"], "RMSE": of["rmse_m"]}
-    errors |= {} if tested is None else {"RMSE with that of the survey": tested["rmse_m"]}
+    errors = dict[str, Mapping[str, float]]()
+    if of := found["errors"].get(key):
+        errors = {f"mean of {of['points']}": of["mean_m"], "RMSE": of["rmse_m"]}
+    if of and kind:
+        errors["RMSE with that of the survey"] = found["errors"]["tested"]["rmse_m"]
     for name, one in errors.items():
         both = (f"{axis} {error_m:.3f}" for axis, error_m in one.items() if axis not in _AXES)
         row = row_of(name, one, [("{:.3f}", axis) for axis in _AXES])

@@ -43,13 +43,23 @@ for name, one in points.items():
 for kind, off in [*kinds.items(), ("tested", kinds["check"])]:
     survey = report["surveyed_m"] ** 2 if kind == "tested" else 0.0
     square = [sum(each[n] ** 2 for each in off) / len(off) + survey for n in range(3)]
-    near(report[kind]["points"], len(off), 0, f"number of {kind} points")
+    near(report["errors"][kind]["points"], len(off), 0, f"number of {kind} points")
     for n, axis in enumerate(("east", "north", "up")):
-        near(report[kind]["rmse_m"][axis], math.sqrt(square[n]), 1e-12, f"RMSE {axis} of {kind}")
+        near(
+            report["errors"][kind]["rmse_m"][axis],
+            math.sqrt(square[n]),
+            1e-12,
+            f"RMSE {axis} of {kind}",
+        )
         mean = sum(each[n] for each in off) / len(off)
-        near(report[kind]["mean_m"][axis], mean, 1e-12, f"mean {axis} of {kind}")
-    near(report[kind]["rmse_m"]["horizontal"], math.sqrt(square[0] + square[1]), 1e-12, kind)
-    near(report[kind]["rmse_m"]["3d"], math.sqrt(sum(square)), 1e-12, kind)
+        near(report["errors"][kind]["mean_m"][axis], mean, 1e-12, f"mean {axis} of {kind}")
+    near(
+        report["errors"][kind]["rmse_m"]["horizontal"],
+        math.sqrt(square[0] + square[1]),
+        1e-12,
+        kind,
+    )
+    near(report["errors"][kind]["rmse_m"]["3d"], math.sqrt(sum(square)), 1e-12, kind)
 
 # Where rays of two images meet, beside what was measured with disparities.
 summary, (drive,) = json.loads((run / "summary.json").read_text()), report["drives"]
@@ -86,7 +96,7 @@ for name, (place, seen, _) in listed.items():
     triangulated += 1
 
 # The files that it is about.
-for name, digest in report["products_sha256"].items():
+for name, digest in report["sha256"]["products"].items():
     if hashlib.sha256((out / name).read_bytes()).hexdigest() != digest:
         sys.exit(f"{name} is another file")
 sys.stdout.write(f"triangulated {triangulated}\n")

@@ -194,8 +194,9 @@ def without(accuracy, name):
     kept = dict(accuracy["survey"]["control"])
     del kept[name]
     placed = {key: one for key, one in accuracy["survey"].items() if key != "control"}
-    same = ("control", "path", "spreads", "system", "drives", "products_sha256")
-    return {"points": kept, "survey": placed, **{key: accuracy[key] for key in same}}
+    same = {key: accuracy[key] for key in ("spreads", "system", "drives")}
+    errors, files = accuracy["errors"]["control"], accuracy["sha256"]["products"]
+    return {"points": kept, "survey": placed, "errors": errors, "files": files, **same}
 
 
 @pytest.fixture
@@ -235,7 +236,7 @@ def test_a_check_point_places_nothing_and_a_bad_one_is_seen_at_once(checked):
     assert row in page
     assert row not in fine
     assert "1 check point: too few for a statement by ASPRS (30)" in page
-    assert moved["check"]["rmse_m"]["up"] == pytest.approx(abs(after["up_m"]), rel=1e-12)
+    assert moved["errors"]["check"]["rmse_m"]["up"] == pytest.approx(abs(after["up_m"]), rel=1e-12)
 
 
 def test_a_bad_control_point_is_left_out_named_and_not_counted(rows, placed):
@@ -248,9 +249,9 @@ def test_a_bad_control_point_is_left_out_named_and_not_counted(rows, placed):
     assert [bad["used"], bad["check"]] == [False, False]
     assert bad["note"].startswith("contradicts the others: ")
     assert bad["east_m"] == pytest.approx(-40.0, abs=0.5)
-    assert found["control"]["points"] == len(found["survey"]["control"]) - 1
-    assert found["check"] is None
-    assert found["control"]["rmse_m"]["3d"] < 0.3
+    assert found["errors"]["control"]["points"] == len(found["survey"]["control"]) - 1
+    assert {*found["errors"]} == {"control"}
+    assert found["errors"]["control"]["rmse_m"]["3d"] < 0.3
     assert f'<tr class="warn"><th scope="row">{name}</th>' in (out / "accuracy.html").read_text()
 
 
@@ -286,11 +287,11 @@ def test_positions_along_the_drive_are_no_check_and_the_report_says_so(small_dem
     done = run("export", small_demo, "--to", "laz", *words)
     assert done.code == 0, done.err
     found = strict(tmp_path / "out")
-    assert found["check"] is found["control"] is found["tested"] is None
+    assert {*found["errors"]} == {"path"}
     assert found["statement"].startswith("No check points: nothing independent")
-    assert found["path"]["points"] == len(path)
-    assert 0.01 < found["path"]["rmse_m"]["3d"] < 0.06
-    assert found["path"]["rmse_m"]["3d"] == pytest.approx(found["survey"]["misfit_rms_m"])
+    assert found["errors"]["path"]["points"] == len(path)
+    assert 0.01 < found["errors"]["path"]["rmse_m"]["3d"] < 0.06
+    assert found["errors"]["path"]["rmse_m"]["3d"] == pytest.approx(found["survey"]["misfit_rms_m"])
     page = (tmp_path / "out/accuracy.html").read_text()
     assert "Path, RMSE horizontal" in page
     assert "http" not in page.replace("http-equiv", "")
