@@ -58,8 +58,8 @@ def export(
     georeference: Annotated[
         Path | None,
         opt.option(
-            "Measured positions, in whose coordinates those for surveying programs are written."
-            + opt.POSITIONS
+            "Measured positions, in whose coordinates those for surveying programs are written, "
+            "with accuracy.html." + opt.POSITIONS
         ),
     ] = None,
     antenna: opt.Antenna = None,

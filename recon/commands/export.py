@@ -19,6 +19,7 @@ from recon.commands.config import (
 from recon.commands.map_summary import CloudSummary, ExportSummary
 from recon.core.errors import FormatError, SettingsError
 from recon.core.machine import available_cores
+from recon.export.accuracy import measure_accuracy
 from recon.export.control import locate
 from recon.export.make import PRODUCTS, check_target, known_products, make, need_rays, write_product
 from recon.export.mesh.pieces import LAYER, WHOLE
@@ -34,6 +35,7 @@ from recon.map.map import Map
 from recon.map.sessions.measured import Survey
 from recon.map.sessions.placed import PlacedMap, place_map, place_map_on
 from recon.map.store.map_file import MAP_FILE
+from recon.report.accuracy_page import write_accuracy_page
 from recon.run.batch.cluster import BatchOptions
 from recon.run.finished import (
     DOUBTS,
@@ -112,6 +114,15 @@ def run_export(
                 there = locate(map_, survey, images, run.threads)
         context = ExportContext(map_, placed, settings.mesh, formats, run.threads, there, images)
         made = make(context, run.content, wanted, run.watch)
+        if there is not None and survey is not None:
+            with run.stage("accuracy"):
+                files = {
+                    "products": {name: run.path(name) for name in run.files()},
+                    "inputs": {str(MAP_FILE): source / MAP_FILE, **survey.files},
+                }
+                accuracy, places = measure_accuracy(context, there, files)
+                run.write_json("accuracy.json", accuracy.to_json())
+                write_accuracy_page(accuracy, places, run)
         doubts, T_map_world = map_.doubts, map_.first.T_map_world
         summary = ExportSummary(
             run=str(source),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -19,6 +20,7 @@ from recon.core.values.arrays import Float64
 from recon.core.values.camera import project, unproject
 from recon.export.product import DriveImages, open_images
 from recon.io.models.las import check_inside
+from recon.io.positions import ControlPoint
 from recon.map.map import Map
 from recon.map.sessions.georeference import ControlFigures, Georeference, edge_m, georeference
 from recon.map.sessions.measured import LEVEL_RAD, Survey, fixed_turn, span_m
@@ -28,7 +30,9 @@ from recon.stereo.rectify.rectifier import turns_of
 
 _FEWEST: Final = 3
 _CLICK_PX: Final = 1.0  # standard deviation of a pixel that a person has chosen
-_SURVEYED_M: Final = 0.02  # of a coordinate, by a receiver with corrections
+SURVEYED_M: Final = 0.02  # of a coordinate, by a receiver with corrections
+_MOST_SIGMAS: Final = 3.0  # by which a coordinate may be off without a word
+_NOWHERE: Final = (np.full(3, np.nan), np.eye(3))
 
 
 class _Sighting(NamedTuple):
@@ -53,59 +57,70 @@ def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | Non
     control, where = survey.control, survey.positions
     if control is None:
         return georeference(map_, survey)
-    images_of = _Images(open_images(map_, images), where, threads)
-    lines, points, ours = [], [], []
-    for point in tracked(control.points, "points", "match control points"):
-        found = _located([images_of.sighting(*seen) for seen in point.seen])
-        if found is None:
-            lines.append(f"control point {point.name} has no depth where it is seen: left out")
-        else:
-            points.append(point)
-            ours.append(found)
-    used = np.array([not point.check for point in points], np.bool_)
+    images_of, points = _Images(open_images(map_, images), where, threads), control.points
+    ours = [
+        _located([images_of.sighting(*seen) for seen in point.seen]) or _NOWHERE
+        for point in tracked(points, "points", "match control points")
+    ]
+    ours_m, place_m = np.array([xyz for xyz, _ in ours]), np.array([p.place_m for p in points])
+    # Check points are only compared: nothing up to the figures depends on them.
+    used = np.isfinite(ours_m[:, 0]) & ~np.array([point.check for point in points])
     if used.sum() < _FEWEST:
         what, expected = "too few control points", f"{_FEWEST} with depth, besides check points"
         raise EvaluationError(what, where=where, got=int(used.sum()), expected=expected)
-    ours_m, place_m = np.array([xyz for xyz, _ in ours]), np.array([p.place_m for p in points])
-    check_inside(control.system, np.median(place_m, axis=0), where)
-    spread = np.array([covariance for _, covariance in ours]) + _SURVEYED_M**2 * np.eye(3)
-    sigma_m = np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
-    allowed_m = 4 * float(np.median(sigma_m))
+    check_inside(control.system, np.median(place_m[used], axis=0), where)
+    spread = np.array([covariance for _, covariance in ours]) + SURVEYED_M**2 * np.eye(3)
+    sigma_m = np.sqrt(np.linalg.eigvalsh(spread[used])[:, -1])
     agree = used.copy()
-    agree[used] = find_agreeing(ours_m[used], place_m[used], allowed_m)
+    agree[used] = find_agreeing(ours_m[used], place_m[used], 4 * float(np.median(sigma_m)))
     T = _fitted(ours_m[agree], place_m[agree], spread[agree])
-    off_m = apply(T, ours_m) - place_m
-    freedom = max(1, 3 * int(agree.sum()) - 6)
-    worse = np.sqrt(np.sum((off_m[agree] / sigma_m[agree, None]) ** 2) / freedom)
-    known_m = sigma_m[agree] * max(1.0, float(worse))
-    there_m = apply(T, ours_m[agree])
-    turn = fixed_turn(there_m, place_m[agree], known_m, where, "control points")
-    for n in np.flatnonzero(used & ~agree):
-        apart = f"{metres(float(np.linalg.norm(off_m[n])))} off"
-        lines.append(f"control point {points[n].name} contradicts the others: {apart}, left out")
-    compared = {
-        point.name: ControlFigures(
-            east_m=float(off_m[n, 0]),
-            north_m=float(off_m[n, 1]),
-            up_m=float(off_m[n, 2]),
-            sigma_m=float(sigma_m[n]),
-            used=bool(agree[n]),
-            check=not used[n],
-        )
-        for n, point in enumerate(points)
-    }
-    return Georeference(
+    there_m, sigma_m = apply(T, ours_m), sigma_m[agree[used]]
+    off_m, freedom = there_m - place_m, max(1, 3 * int(agree.sum()) - 6)
+    worse = np.sqrt(np.sum((off_m[agree] / sigma_m[:, None]) ** 2) / freedom)
+    known_m = sigma_m * max(1.0, float(worse))
+    turn = fixed_turn(there_m[agree], place_m[agree], known_m, where, "control points")
+    placed = Georeference(
         T,
         control.system,
-        np.linalg.norm(off_m[agree], axis=1),
-        span_m(place_m),
+        off_m[agree],
+        span_m(place_m[agree]),
         fit_points(ours_m[agree], place_m[agree], scaled=True).scale,
         int((used & ~agree).sum()),
-        tuple(lines),
+        (),
         turn,
         edge_m(map_, T, turn, place_m[agree]),
-        compared,
+        place_m[agree].mean(axis=0),
+        float(np.sum(known_m**-2.0) ** -0.5),
     )
+    checked = np.array([point.check for point in points])[:, None, None]
+    expected_m2 = T[:3, :3] @ spread @ T[:3, :3].T + checked * placed.covariance(place_m)
+    rows = zip(points, off_m, expected_m2, agree, strict=True)
+    compared = {point.name: _compared(point, *row) for point, *row in rows}
+    lines = (
+        f"{'check' if one.check else 'control'} point {name} {one.note}"
+        for name, one in compared.items()
+        if one.note
+    )
+    return replace(placed, points=compared, lines=tuple(lines))
+
+
+def _compared(
+    point: ControlPoint, off_m: Float64, expected_m2: Float64, used: bool
+) -> ControlFigures:
+    """Return how far the map is off a point (3,), beside the covariance (3, 3) of that."""
+    sigma_m = np.sqrt([*np.diag(expected_m2), np.linalg.eigvalsh(expected_m2)[-1]])
+    sigma_m[np.isnan(off_m[0])] = np.nan
+    apart, times = metres(float(np.linalg.norm(off_m))), np.max(np.abs(off_m) / sigma_m[:3])
+    notes = {
+        "has no depth where it is seen: left out": np.isnan(times),
+        f"contradicts the others: {apart} off, left out": not (used or point.check),
+        f"is {apart} off, {times:.1f} standard deviations in a coordinate": times > _MOST_SIGMAS,
+    }
+    note = next((text for text, holds in notes.items() if holds), "")
+    (e, n, u), (sigma_e, sigma_n, sigma_u, worst) = off_m.tolist(), sigma_m.tolist()
+    images = [image for image, _ in point.seen]
+    state = images, bool(used), point.check, note
+    return ControlFigures(e, n, u, sigma_e, sigma_n, sigma_u, worst, *state)
 
 
 class _Images:

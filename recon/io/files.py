@@ -215,6 +215,15 @@ _PIECE_BYTES: Final = 1 << 20
 _SAMPLE_BYTES: Final = 1 << 12
 
 
+def digest_of(path: Path, kind: str = "sha256") -> str:
+    """Return the hash of a file's bytes in hexadecimal, as ``sha256sum`` prints it."""
+    digest = hashlib.new(kind, usedforsecurity=False)
+    with path.open("rb") as content:
+        while piece := content.read(_PIECE_BYTES):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
 def fingerprint(files: Iterable[Path], *, samples: int | None = None) -> dict[str, Any]:
     """Return the number and size of a list of files, and one SHA-256 of names and bytes, in order.
 

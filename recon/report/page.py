@@ -35,11 +35,11 @@ _WEBP_MOST_PX: Final = 16_383  # a side of a picture, by its format
 _SAID_ELSEWHERE: Final = frozenset({"stages", "warnings", "findings"})
 
 
-def write_page(page: Page, run: RunDirectory) -> None:
-    """Write ``report.html`` of a run."""
+def write_page(page: Page, run: RunDirectory, name: str = "report.html") -> None:
+    """Write the report of a run, or another page."""
     path = run.path("config.yaml")
     config = path.read_text(encoding="utf-8") if path.is_file() else ""
-    write_text(run.path("report.html"), render_page(page, command_line(), config, versions()))
+    write_text(run.path(name), render_page(page, command_line(), config, versions()))
 
 
 def render_page(

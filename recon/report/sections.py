@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Literal
 
@@ -72,6 +72,7 @@ class Table:
     best: Literal["columns", "rows", "nowhere"] = "nowhere"  # where to look for smallest numbers
     caption: str = ""
     links: Mapping[str, str] | None = None  # files to look at, by the name of the row
+    bad: Collection[str] = ()  # names of rows that stand out
 
     @property
     def empty(self) -> bool:

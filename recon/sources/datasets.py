@@ -6,7 +6,6 @@ The list is ``datasets.toml`` beside this file; its first lines explain it.
 from __future__ import annotations
 
 import difflib
-import hashlib
 import json
 import math
 import os
@@ -28,7 +27,7 @@ from recon.core.settings import Settings
 from recon.io.atomic import take_lock, write_text
 from recon.io.download import OnBytes, download, unpack
 from recon.io.fields import read_toml
-from recon.io.files import read_text, reading, refuse_links
+from recon.io.files import digest_of, read_text, reading, refuse_links
 
 _LIST: Final = Path(__file__).with_suffix(".toml")
 RECORD: Final = "dataset.json"  # what was fetched, and size and hash of each file
@@ -178,7 +177,8 @@ def _receive(one: Archive, part: Part, work: Path, mirror: str | None) -> dict[s
     if not path.is_file():
         with _shown(one) as on_bytes:
             download(address, path, one.bytes, on_bytes)
-    found = _digest(path, promised.partition(":")[0]) if promised else None
+    kind = promised.partition(":")[0] if promised else ""
+    found = f"{kind}:{digest_of(path, kind)}" if kind else None
     if found != promised:
         path.unlink()
         what, hint = "the file is not what was promised", "try again, or another --address"
@@ -186,7 +186,7 @@ def _receive(one: Archive, part: Part, work: Path, mirror: str | None) -> dict[s
     return {
         "address": address,
         "bytes": path.stat().st_size,
-        "digest": _digest(path, "sha256"),
+        "digest": f"sha256:{digest_of(path)}",
         "checked": promised or ("size" if one.bytes else "nothing"),
     }
 
@@ -243,15 +243,7 @@ def verify_part(name: str, folder: Path) -> dict[str, Any]:
 
 
 def _facts(path: Path) -> list[Any]:
-    return [path.stat().st_size, _digest(path, "sha256").partition(":")[2]]
-
-
-def _digest(path: Path, kind: str) -> str:
-    digest = hashlib.new(kind, usedforsecurity=False)
-    with path.open("rb") as file:
-        while piece := file.read(_MEGABYTE):
-            digest.update(piece)
-    return f"{kind}:{digest.hexdigest()}"
+    return [path.stat().st_size, digest_of(path)]
 
 
 def _recorded_files(place: Path) -> dict[str, list[Any]]:

@@ -1,6 +1,10 @@
 """A map is placed by points that images show and a survey has measured."""
 
+import json
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -176,3 +180,133 @@ def test_paths_are_not_bent_by_control_points(rows, small_demo, tmp_path):
     (tmp_path / "gcp.txt").write_text("\n".join([HEAD, *rows]))
     done = run("merge", small_demo, "--georeference", tmp_path / "gcp.txt", "--out", tmp_path / "o")
     assert_refused(done, "control points have no times")
+
+
+def strict(out):
+    def refused(constant):
+        raise AssertionError(constant)
+
+    return json.loads((out / "accuracy.json").read_text(), parse_constant=refused)
+
+
+def without(accuracy, name):
+    """What a report says that does not depend on a check point."""
+    kept = dict(accuracy["survey"]["control"])
+    del kept[name]
+    placed = {key: one for key, one in accuracy["survey"].items() if key != "control"}
+    same = {key: accuracy[key] for key in ("spreads", "system", "drives")}
+    errors, files = accuracy["errors"]["control"], accuracy["sha256"]["products"]
+    return {"points": kept, "survey": placed, "errors": errors, "files": files, **same}
+
+
+@pytest.fixture
+def checked(rows, placed):
+    """What an export says with one check point, and the same with it moved by so many metres."""
+    name = rows[0].split()[6]
+
+    def export(*moved_m):
+        lines = []
+        for row in rows:
+            *place, u, v, image, point = row.split()
+            if point == name:
+                by = moved_m or (0.0, 0.0, 0.0)
+                place = [f"{float(x) + m:.4f}" for x, m in zip(place, by, strict=True)]
+                point += " check"
+            lines.append(" ".join([*place, u, v, image, point]))
+        done, out = placed(lines)
+        assert done.code == 0, done.err
+        return strict(out), summary_of(out), (out / "accuracy.html").read_text()
+
+    return name, export
+
+
+def test_a_check_point_places_nothing_and_a_bad_one_is_seen_at_once(checked):
+    name, export = checked
+    (honest, _, fine), (moved, summary, page) = export(), export(0.5, -0.3, 0.8)
+    assert without(honest, name) == without(moved, name)
+    before, after = (one["survey"]["control"][name] for one in (honest, moved))
+    apart = [after[key] - before[key] for key in ("east_m", "north_m", "up_m")]
+    np.testing.assert_allclose(apart, [-0.5, 0.3, -0.8], atol=2e-4)
+    assert not before["note"]
+    assert "standard deviations in a coordinate" in after["note"]
+    (said,) = [line for line in summary["warnings"] if "check point" in line]
+    assert said == f"check point {name} {after['note']}"
+    assert moved["warnings"] == [said]
+    row = f'<tr class="warn"><th scope="row">{name}</th>'
+    assert row in page
+    assert row not in fine
+    assert "1 check point: too few for a statement by ASPRS (30)" in page
+    assert moved["errors"]["check"]["rmse_m"]["up"] == pytest.approx(abs(after["up_m"]), rel=1e-12)
+
+
+def test_a_bad_control_point_is_left_out_named_and_not_counted(rows, placed):
+    name = rows[0].split()[6]
+    lines = [f"{float(row.split()[0]) + 40} {row.split(' ', 1)[1]}"
+             if row.endswith(name) else row for row in rows]  # fmt: skip
+    _, out = placed(lines)
+    found = strict(out)
+    bad = found["survey"]["control"][name]
+    assert [bad["used"], bad["check"]] == [False, False]
+    assert bad["note"].startswith("contradicts the others: ")
+    assert bad["east_m"] == pytest.approx(-40.0, abs=0.5)
+    assert found["errors"]["control"]["points"] == len(found["survey"]["control"]) - 1
+    assert {*found["errors"]} == {"control"}
+    assert found["errors"]["control"]["rmse_m"]["3d"] < 0.3
+    assert f'<tr class="warn"><th scope="row">{name}</th>' in (out / "accuracy.html").read_text()
+
+
+def test_a_point_without_depth_is_listed_without_numbers(rows, placed):
+    _, out = placed(
+        [*rows, "455800 5429300 115 1 1 0 <sky> check"]
+    )  # beyond what the right one sees
+    sky = strict(out)["survey"]["control"]["<sky>"]
+    assert (sky["east_m"], sky["sigma_m"]) == (None, None)
+    assert sky["note"] == "has no depth where it is seen: left out"
+    assert sky["images"] == ["0"]
+    assert "<sky>" not in (out / "accuracy.html").read_text()
+
+
+def test_the_report_is_what_a_script_that_shares_no_code_finds(rows, placed, small_demo):
+    lines = [f"{row} check" if row.split()[6] == rows[-1].split()[6] else row for row in rows]
+    _, out = placed(lines)
+    script = [sys.executable, "-I", Path(__file__).with_name("accuracy_by_hand.py")]
+    words = (out, out.parent / "gcp_list.txt", small_demo)
+    done = subprocess.run([*script, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"triangulated [1-9]", done.stdout)
+
+
+def test_positions_along_the_drive_are_no_check_and_the_report_says_so(small_demo, tmp_path):
+    path = np.loadtxt(small_demo / "trajectory_tum.txt")
+    T = np.array(summary_of(small_demo)["T_map_world"])
+    places = apply(T_SURVEY_TRUE @ np.linalg.inv(make_transform(AXES_MAP_WORLD, np.zeros(3))) @ T,
+                   path[:, 1:4])  # fmt: skip
+    places += np.random.default_rng(3).normal(0.0, 0.02, places.shape)
+    np.savetxt(tmp_path / "gnss.txt", np.column_stack([path[:, 0], places, [0.02] * len(path)]))
+    words = ("--georeference", tmp_path / "gnss.txt", "--crs", HEAD, "--out", tmp_path / "out")
+    done = run("export", small_demo, "--to", "laz", *words)
+    assert done.code == 0, done.err
+    found = strict(tmp_path / "out")
+    assert {*found["errors"]} == {"path"}
+    assert found["statement"].startswith("No check points: nothing independent")
+    assert found["errors"]["path"]["points"] == len(path)
+    assert 0.01 < found["errors"]["path"]["rmse_m"]["3d"] < 0.06
+    assert found["errors"]["path"]["rmse_m"]["3d"] == pytest.approx(found["survey"]["misfit_rms_m"])
+    page = (tmp_path / "out/accuracy.html").read_text()
+    assert "Path, RMSE horizontal" in page
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_ground_and_rig_are_those_of_the_street(rows, placed, small_demo):
+    _, out = placed(rows)
+    found, camera = strict(out), demo_source(run_settings(small_demo)).calibration
+    (drive,) = found["drives"]
+    assert drive["focal_px"] == pytest.approx(camera.focal_px)
+    assert drive["baseline_m"] == pytest.approx(camera.baseline_m)
+    assert drive["frames"] == drive["frames_placed"] == summary_of(small_demo)["frames"]
+    gsd, frames = found["spreads"]["gsd_m"], found["spreads"]["frames"]
+    # From just ahead of the car to as far as rays are kept.
+    assert 1.0 / camera.focal_px < gsd["p5"] <= gsd["median"] <= gsd["p95"] < 30 / camera.focal_px
+    assert 1 <= frames["p5"] <= frames["median"] <= drive["frames"]
+    assert 0.0 < found["spreads"]["keyframe_overlap"]["median"] <= 1.0
+    assert found["spreads"]["sigma_m"]["median"] >= found["surveyed_m"] / 3

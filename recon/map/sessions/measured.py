@@ -83,6 +83,13 @@ class Survey:
                 hint="it is metres forward, left and up from the left camera",
             )
 
+    @property
+    def files(self) -> dict[str, Path]:
+        """The files of the positions by their names, below that of their folder if it is one."""
+        place = Path(str(self.positions).partition(":/")[0])  # without the name of a topic
+        files = [place] if place.is_file() else sorted(filter(Path.is_file, place.rglob("*")))
+        return {one.relative_to(place.parent).as_posix(): one for one in files}
+
     @cached_property
     def control(self) -> ControlPoints | None:
         """The control points of the file; None = it has positions of a drive."""
