@@ -51,7 +51,7 @@ SCENE = "scenes/square/im0.png scenes/square/im1.png"
 TRUTH = "drive/poses.txt"
 COMMANDS = [
     ("map drive --out new", r"drive .*\d/8"),
-    ("audit drive", r"check the recording .*\d/\d"),
+    ("audit drive", r"look at the images .*\d/\d"),
     ("export run --to cloud,mesh,mcap --images drive --out products", r"mcap .*\d/\d .*images/s"),
     ("export run --to costmap,gridmap --out ros", r"costmap .*\d/\d.* tiles"),
     ("mesh run --out mesh --set mesh.min_component_faces=1", r"mesh .*\d/\d"),
