@@ -17,7 +17,6 @@ from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext, ExportResult, PointFigures
 from recon.io.atomic import write_bytes, write_text
 from recon.io.models.tiles3d import write_tiles3d
-from recon.map.store.session import Session
 from recon.map.tiles import Tiles
 
 _PAGE: Final = Path(__file__).with_name("web.html")
@@ -45,7 +44,11 @@ def web_product(context: ExportContext, folder: Path) -> ExportResult:
     ends = np.flatnonzero(np.diff(context.placed.trusted.astype(np.int8), prepend=0, append=0))
     step = 1 + len(path_m) // _MOST_POSES
     about = {
-        "drives": [_told(one) for one in context.map.linked],
+        # Of files, the date may be that of a copy.
+        "drives": [
+            [Path(one.info.source).name, one.date.text if one.date.known_from != "file" else ""]
+            for one in context.map.linked
+        ],
         "points": points,
         "spacing_m": voxel_m,
         "grid": cells > 0,
@@ -58,12 +61,6 @@ def web_product(context: ExportContext, folder: Path) -> ExportResult:
     write_text(folder / "map.json", json.dumps(about, allow_nan=False))
     write_bytes(folder / "index.html", _PAGE.read_bytes())
     return ExportResult(PointFigures(points), warnings)
-
-
-def _told(drive: Session) -> tuple[str, str]:
-    """Return name and date of a drive; that of its files may be the date of a copy."""
-    date = "" if drive.date.known_from == "file" else drive.date.text
-    return Path(drive.info.source).name, date
 
 
 def _draped(tiles: Tiles, grid: OccupancyGrid, flattening: Flattening) -> Iterator[PointCloud]:

@@ -180,6 +180,7 @@ class Quiet(SimpleHTTPRequestHandler):
 def shown(folder: Path, profile: Path) -> Iterator[tuple[chromium.Page, str]]:
     """The page of a folder, and the address of its server."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=folder)) as server:
+        server.handle_error = lambda *_: None  # a browser that is closed waits for no answer
         threading.Thread(target=server.serve_forever, daemon=True).start()
         try:
             with chromium.opened(profile, "--window-size=1400,900") as page:
@@ -209,7 +210,7 @@ class TestInABrowser:
                 first_ms.append(float(wait_for(page, "firstMs")))
             assert 0 < min(first_ms) < 3000
             wait_for(page, "allMs")
-            drawn, _, of, _ = page.run("$('#count').textContent").replace(",", "").split()
+            drawn, _, of, *_ = page.run("$('#count').textContent").replace(",", "").split()
             assert int(of) == COUNT - 1600
             assert 500_000 < int(drawn) <= int(of)
             # What is nearer is drawn in full, and what is out of view is not loaded for it.
@@ -290,18 +291,29 @@ class TestInABrowser:
                 after = np.array(page.run(state))
                 assert set(np.flatnonzero(after != before)) == changed, key
                 before = after
-            drag = (
-                "for (const [kind, clientX, buttons] of"
-                "  [['down', 700, BUTTON], ['move', 760, BUTTON], ['up', 760, 0]])"
-                "canvas['onpointer' + kind]"
-                "({pointerId: 1, clientX, clientY: 400, buttons, button: 0})"
+            gesture = (
+                "for (const [kind, pointerId, clientX, buttons] of GESTURE)"
+                "  canvas['onpointer' + kind]({pointerId, clientX, clientY: 400, buttons, button: 0})"
             )
             page.run("canvas.setPointerCapture = () => 0")
             for button, changed in ((1, {0}), (2, {3, 4})):
-                page.run(drag.replace("BUTTON", str(button)))
+                moves = [["down", 1, 700, button], ["move", 1, 760, button], ["up", 1, 760, 0]]
+                page.run(gesture.replace("GESTURE", str(moves)))
                 after = np.array(page.run(state))
                 assert set(np.flatnonzero(np.abs(after - before) > 1e-9)) == changed
                 before = after
+            # Two fingers, one of which leaves the other.
+            moves = [
+                ["down", 1, 600, 1],
+                ["down", 2, 800, 1],
+                ["move", 2, 900, 1],
+                ["up", 2, 900, 0],
+            ]
+            page.run(gesture.replace("GESTURE", str([*moves, ["up", 1, 600, 0]])))
+            after = np.array(page.run(state))
+            assert after[2] == pytest.approx(before[2] * 200 / 300)
+            assert (after[:2] == before[:2]).all()
+            assert page.run("picked.length") == 0
             page.press("Home")
             assert page.run("far") > before[2]
 

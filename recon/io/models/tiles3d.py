@@ -45,10 +45,8 @@ def write_tiles3d(
     Ref: OGC 22-025r4, "3D Tiles", with the point cloud tiles of version 1.0.
     """
     depths = 1 + max(0, math.ceil(math.log2(side_m / spacing_m / NODE_CELLS)))
-    shared, tiles = (
-        defaultdict[Node, list[PointCloud]](list),
-        defaultdict[Node, dict[str, Any]](dict),
-    )
+    shared = defaultdict[Node, list[PointCloud]](list)
+    tiles = defaultdict[Node, dict[str, Any]](dict)
     bounds: dict[Node, Any] = {_ROOT: np.inf}  # lowest corner, and the highest one negated
 
     def put(node: Node, cloud: PointCloud) -> None:
@@ -72,9 +70,8 @@ def write_tiles3d(
     for node in sorted(bounds if points else (), reverse=True):  # the deepest come first
         tile, cell_m = tiles[node], side_m / NODE_CELLS / 2.0 ** node[0]
         low, high = bounds[node] * [[1], [-1]]
-        half = np.diag((high - low) / 2).ravel().tolist()
-        leaf = "children" not in tile
-        tile["boundingVolume"] = {"box": [*((low + high) / 2).tolist(), *half]}
+        box = np.vstack([(low + high) / 2, np.diag((high - low) / 2)])
+        leaf, tile["boundingVolume"] = "children" not in tile, {"box": box.ravel().tolist()}
         tile["geometricError"] = 0.0 if leaf else _ERROR_CELLS * cell_m
         tile.setdefault("extras", {})["spacing_m"] = spacing_m if leaf else cell_m
         if node != _ROOT:
@@ -82,12 +79,8 @@ def write_tiles3d(
             bounds[above] = np.minimum(bounds[above], bounds[node])
             tiles[above].setdefault("children", []).append(tile)
     if points:
-        root = tiles[_ROOT] | {"refine": "ADD"}
-        whole = {
-            "asset": {"version": "1.0"},
-            "geometricError": root["geometricError"],
-            "root": root,
-        }
+        root, error_m = tiles[_ROOT] | {"refine": "ADD"}, tiles[_ROOT]["geometricError"]
+        whole = {"asset": {"version": "1.0"}, "geometricError": error_m, "root": root}
         write_text(folder / "tileset.json", json.dumps(whole, allow_nan=False))
     return points
 
