@@ -293,7 +293,7 @@ class TestInABrowser:
                 before = after
             gesture = (
                 "for (const [kind, pointerId, clientX, buttons] of GESTURE)"
-                "  canvas['onpointer' + kind]({pointerId, clientX, clientY: 400, buttons, button: 0})"
+                "canvas['onpointer' + kind]({pointerId, clientX, clientY: 400, buttons, button: 0})"
             )
             page.run("canvas.setPointerCapture = () => 0")
             for button, changed in ((1, {0}), (2, {3, 4})):
