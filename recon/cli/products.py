@@ -47,7 +47,7 @@ def export(
             "cloud, grid, octomap, mesh; costmap (Nav2), esdf (distances, NumPy); for surveying "
             "programs las, laz, copc, e57, and dsm, dtm, slope, orthophoto, grid-geotiff "
             "(GeoTIFF); pcd (PCL), npz (NumPy), mcap, gridmap (ROS 2), colmap, nerfstudio, "
-            "texture; several with commas.",
+            "texture, web (a page for any server); several with commas.",
             default="the first four",
         ),
     ] = None,

@@ -40,6 +40,7 @@ from recon.export.occupancy import (
 )
 from recon.export.product import ExportContext, ExportResult, Product, ProductFigures
 from recon.export.rasters import RASTERS, raster_product, stem_of
+from recon.export.web import web_product
 from recon.io.atomic import check_targets, writing_to
 from recon.io.models.mesh import MESH_SUFFIXES
 from recon.map.ground.surface import BIN_M
@@ -70,6 +71,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
     "pcd": Product("map/cloud.pcd", pcd_product),
     "npz": Product("map/map.npz", arrays_product),
     "mcap": Product("bag", mcap_product, needs_occupancy=True, surveyed=True),
+    "web": Product("web", web_product, needs_occupancy=True, surveyed=True),
     "gridmap": Product("gridmap", gridmap_product, needs_occupancy=True),
     "colmap": Product("colmap", colmap_product, needs_images=True),
     "nerfstudio": Product("nerfstudio", nerfstudio_product, needs_images=True),

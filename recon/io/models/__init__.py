@@ -1,1 +1,1 @@
-"""Point clouds (`columns.py`: what formats call attributes), meshes, COLMAP, maps from above."""
+"""Clouds (`columns.py`: what formats call attributes), 3D Tiles, meshes, COLMAP, rasters."""

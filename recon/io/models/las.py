@@ -160,7 +160,8 @@ def las_record(
     return record
 
 
-_CELL_BITS: Final = 7  # a node has 128 cells along each side, with a point for each
+_CELL_BITS: Final = 7
+NODE_CELLS: Final = 1 << _CELL_BITS  # of a node of an octree, along each side
 _INFO: Final = struct.Struct("<5d2Q2d88x")  # the first record of the file
 _INFO_AT: Final = 375 + 54  # behind the header of LAS 1.4 and that of the record
 _LONG: Final = struct.Struct("<2x16sHQ32s")  # the header of a record behind the points
@@ -192,12 +193,7 @@ def write_copc(
     low, high = (steps.min(axis=0), steps.max(axis=0)) if len(steps) else np.zeros((2, 3), int)
     # The cube is no larger than its longest side: there are readers that take that for granted.
     side = max(1, int((high - low).max()))
-    nodes = _octree(steps - low, side)
-    order = np.lexsort(nodes.T[::-1])
-    nodes = nodes[order]
-    begins = np.flatnonzero(np.diff(nodes, axis=0, prepend=-1).any(axis=1))
-    chunks = np.split(points.array[order], begins[1:])
-
+    nodes, parts = octree(steps - low, side)
     packed = lazrs.LazVlr.new_for_compression(COLOURED, points.point_format.num_extra_bytes, True)
     info = laspy.VLR("copc", 1, "", bytes(_INFO.size))
     header.update(points)
@@ -206,15 +202,15 @@ def write_copc(
     with packing(path) as temporary, temporary.open("w+b") as file:
         header.write_to(file)
         packer = lazrs.ParLasZipCompressor(file, packed)
-        packer.compress_chunks([np.frombuffer(chunk, np.uint8) for chunk in chunks])
+        packer.compress_chunks([np.frombuffer(points.array[one], np.uint8) for one in parts])
         packer.done()
         header.start_of_first_evlr = file.seek(0, SEEK_END)
         file.seek(header.offset_to_point_data)
-        entries = np.zeros(len(begins), _ENTRY)
+        entries = np.zeros(len(nodes), _ENTRY)
         entries["points"], entries["bytes"] = np.array(lazrs.read_chunk_table(file, packed)).T
         # A chunk begins where those before it end, the first behind where their table is.
         ends = header.offset_to_point_data + 8 + np.cumsum(entries["bytes"])
-        entries["node"], entries["offset"] = nodes[begins], ends - entries["bytes"]
+        entries["node"], entries["offset"] = nodes, ends - entries["bytes"]
         file.seek(header.start_of_first_evlr)
         file.write(_LONG.pack(b"copc", 1000, entries.nbytes, b"") + entries.tobytes())
         file.seek(0)
@@ -226,19 +222,25 @@ def write_copc(
     return len(points)
 
 
-def _octree(steps: Int64, side: int) -> Int64:
-    """Return the node (N, 4), depth and cell, of each point (N, 3) in a cube, all in steps.
+def octree(
+    steps: Int64, side: int, depths: int = KEY_BITS - _CELL_BITS
+) -> tuple[Int64, list[Int64]]:
+    """Return the nodes (K, 4), depth and cell, of points (N, 3) in a cube, and the rows of each.
 
-    A node has the first of the points left in each of its cells, the deepest ones all.
+    A node has the first of the points left in each of its cells, the deepest ones all. Positions
+    are in steps, of which a side of the cube has so many.
     """
     nodes, left = np.zeros((len(steps), 4), np.int64), np.arange(len(steps))
-    for depth in range(KEY_BITS - _CELL_BITS):
+    for depth in range(depths):
         bits = depth + _CELL_BITS
         cells = np.minimum((steps[left] << bits) // side, (1 << bits) - 1)
         nodes[left, 0], nodes[left, 1:] = depth, cells >> _CELL_BITS
         _, first = np.unique(pack_keys(cells), return_index=True)
         left = np.delete(left, first)
-    return nodes
+    order = np.lexsort(nodes.T[::-1])
+    nodes = nodes[order]
+    begins = np.flatnonzero(np.diff(nodes, axis=0, prepend=-1).any(axis=1))
+    return nodes[begins], np.split(order, begins[1:])
 
 
 _AXES: Final = ("cartesianX", "cartesianY", "cartesianZ")
