@@ -1,4 +1,4 @@
-"""The surface of a map with the images of its drives as its texture: decision 0037.
+"""The surface of a map with the images of its drives as its texture: decisions 0037, 0078.
 
 Every texel has the mean colour of the images that see it with nothing in between, each weighted by
 how large it sees the surface there, and less at its border. Weights are those of vertices, and
