@@ -98,6 +98,18 @@ def test_exposures_are_evened_and_those_of_the_fused_points():
     assert halves[0] == pytest.approx(halves[1], rel=0.05)
 
 
+def test_exposures_are_evened_where_the_surface_has_no_colours():
+    gains = (1.3, 0.7, 1.2, 0.8)
+    views = [photograph(n, 0.5 * n, 0.0, gain) for n, gain in enumerate(gains)]
+    places, rgb, figures = painted(replace(ground(), rgb=None), views)
+    near = (places[:, 0] > 2.5) & (places[:, 0] < 4.5) & (np.abs(places[:, 1]) < 0.8)
+    off = rgb[near] / colour_at(places[near])
+    # Nothing says how bright the surface is: as the images are, in the mean.
+    assert np.median(off) == pytest.approx(np.exp(np.mean(np.log(gains))), rel=0.05)
+    assert np.percentile(off, 90) / np.percentile(off, 10) < 1.3
+    assert 0.5 < figures.textured <= 1
+
+
 def test_what_passed_by_in_one_image_is_not_painted():
     views = [photograph(n, 0.05 * n, 0.0) for n in range(4)]
     passed = views[3].image.copy()  # the nearest

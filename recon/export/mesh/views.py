@@ -23,7 +23,6 @@ _STEP: Final = 2  # pixels between the rays that say how far an image sees
 _SAMPLES: Final = 50_000  # most vertices that exposures are compared at
 _DARK, _BRIGHT = 8, 247  # beyond, exposures cannot be compared
 _ANCHOR: Final = 1e-3  # how much the fused points count beside an image
-_NOTHING: Final = 1e-9
 
 
 class PosedImage(NamedTuple):
@@ -99,7 +98,7 @@ class Exposures:
 
     def __init__(self, mesh: TriangleMesh) -> None:
         chosen = slice(None, None, -(-len(mesh.vertices) // _SAMPLES))
-        self._xyz, self._rgb = mesh.vertices[chosen], mesh.rgb
+        self._xyz = mesh.vertices[chosen]
         self._fused = None if mesh.rgb is None else mesh.rgb[chosen].mean(axis=1)
         self.footprint_m = np.full(len(self._xyz), np.inf, np.float32)
         self._looks: list[Float64] = []  # (3, N): vertices, images, logarithms of grey levels
@@ -129,9 +128,10 @@ class Exposures:
         place, image = place.astype(np.int64), image.astype(np.int64)
         weight = np.where(image == count, _ANCHOR, 1.0)
         seen = csr_array((weight, (place, image)), (len(self._xyz), count + 1))
-        total = np.maximum(seen.sum(axis=1), _NOTHING)
+        total = np.maximum(seen.sum(axis=1), _ANCHOR)
         mean = np.bincount(place, weight * level, len(total)) / total
-        matrix = diags_array(seen.sum(axis=0) + _NOTHING) - seen.T @ diags_array(1 / total) @ seen
+        # An image that shares nothing with others keeps its brightness.
+        matrix = diags_array(seen.sum(axis=0) + _ANCHOR) - seen.T @ diags_array(1 / total) @ seen
         right = seen.T @ mean - np.bincount(image, weight * level, count + 1)
         gains = spsolve(matrix.tocsc(), right)
         gains = np.exp(gains - gains[count])
