@@ -37,7 +37,8 @@ from recon.core.values import RectifiedCamera, TriangleMesh
 from recon.core.values.arrays import Float64, UInt8
 from recon.core.values.camera import unproject
 from recon.export.mesh.pieces import WHOLE
-from recon.export.mesh.texture import PosedImage, posed_images, textured_mesh
+from recon.export.mesh.texture import textured_mesh
+from recon.export.mesh.views import PosedImage, posed_images
 from recon.export.product import open_images
 from recon.io.images.image import write_image
 from recon.io.models.mesh import read_mesh

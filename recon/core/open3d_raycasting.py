@@ -39,6 +39,11 @@ class RayScene:
         faces = hits["primitive_ids"].numpy()
         return np.where(faces == _NO_HIT, -1, faces.astype(np.int64)).astype(np.int32)
 
+    def reach(self, origins: Float64, directions: NDArray[Any]) -> Float32:
+        """Return float32 (N,): times its direction, how far each ray goes; infinity = no hit."""
+        hits = self._scene.cast_rays(_rays(origins, directions), nthreads=self._threads)
+        return np.asarray(hits["t_hit"].numpy(), dtype=np.float32)
+
     def distance(self, points: NDArray[Any]) -> Float32:
         """Return distance of each point (N, 3) to the nearest triangle: float32 (N,), metres."""
         wanted = o3d.core.Tensor.from_numpy(np.array(points, dtype=np.float32))

@@ -151,7 +151,8 @@ class DriveImages:
         Those of the first frames stay in memory, as many as fit: whoever comes next need not read
         and rectify them again.
         """
-        yield from [*self.kept.items()]
+        if self.kept:
+            yield from tracked([*self.kept.items()], "images")
         room = _KEPT_BYTES - sum(one.nbytes for images in self.kept.values() for one in images)
         for frame, pair in self.pairs(max(self.kept, default=-1) + 1):
             images = self.rectified(pair)

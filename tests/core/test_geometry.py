@@ -330,6 +330,8 @@ def test_rays_hit_the_nearest_triangle_and_segments_are_blocked_between_their_en
     assert (hits.dtype, hits.tolist()) == (np.int32, [0, 1, 2, -1, -1])
     assert scene.first_hit(np.array([0.0, 0.0, 9.0]), np.array([[0.2, 0.1, -4.0]]))[0] in (2, 3)
     assert scene.first_hit(np.zeros(3), np.empty((0, 3))).shape == (0,)
+    far = scene.reach(np.zeros(3), rays)
+    np.testing.assert_allclose(far, [2, 2, 5, np.inf, np.inf], rtol=1e-6)
     reach = np.array([[0.0, 0.1, 1.9], [0.0, 0.1, 2.1], [0.0, 0.1, 4.0]])
     assert scene.blocked(np.zeros(3), reach).tolist() == [False, True, True]
     assert scene.blocked(np.zeros(3), reach, far=0.45).tolist() == [False, False, False]

@@ -11,9 +11,11 @@ from recon.core.errors import MeshingError
 from recon.core.geometry.se3 import T_YUP_FRAME, apply, exp_so3, invert, make_transform
 from recon.core.values import RectifiedCamera, TriangleMesh
 from recon.core.values.camera import project, unproject
+from recon.export.mesh import charts
 from recon.export.mesh.charts import make_atlas, ratios_of, texels_of
 from recon.export.mesh.cut import vertex_normals
-from recon.export.mesh.texture import PosedImage, textured_mesh
+from recon.export.mesh.texture import textured_mesh
+from recon.export.mesh.views import PosedImage
 from recon.export.product import DriveImages
 from recon.io.images.image import write_image
 from recon.io.models.mesh import Photo, write_mlp
@@ -94,6 +96,18 @@ def test_exposures_are_evened_and_those_of_the_fused_points():
     # Without gains they differ by a half and more from one image to the next.
     halves = [np.median(off[(x := places[near][:, 0]) < 3.5]), np.median(off[x >= 3.5])]
     assert halves[0] == pytest.approx(halves[1], rel=0.05)
+
+
+def test_exposures_are_evened_where_the_surface_has_no_colours():
+    gains = (1.3, 0.7, 1.2, 0.8)
+    views = [photograph(n, 0.5 * n, 0.0, gain) for n, gain in enumerate(gains)]
+    places, rgb, figures = painted(replace(ground(), rgb=None), views)
+    near = (places[:, 0] > 2.5) & (places[:, 0] < 4.5) & (np.abs(places[:, 1]) < 0.8)
+    off = rgb[near] / colour_at(places[near])
+    # Nothing says how bright the surface is: as the images are, in the mean.
+    assert np.median(off) == pytest.approx(np.exp(np.mean(np.log(gains))), rel=0.05)
+    assert np.percentile(off, 90) / np.percentile(off, 10) < 1.3
+    assert 0.5 < figures.textured <= 1
 
 
 def test_what_passed_by_in_one_image_is_not_painted():
@@ -227,3 +241,65 @@ def test_meshlab_sees_a_point_of_the_map_where_the_image_does(tmp_path):
     u, v, _ = project(apply(invert(view.T_map_camera), xyz), CAMERA)
     np.testing.assert_allclose(column - 0.5, u, atol=1e-3)
     np.testing.assert_allclose(240 - 0.5 - row, v, atol=1e-3)
+
+
+def test_an_exposure_that_changes_along_the_drive_is_evened_though_the_fused_points_are_not():
+    # The colours of vertices have what the drive had there: half at its start, twice at its end.
+    mesh, gains = fused(), np.geomspace(0.6, 1.4, 9)
+    there = np.interp(mesh.vertices[:, 0], [1.5, 5], [0.6, 1.4])[:, None]
+    mesh = replace(mesh, rgb=np.rint(there * mesh.rgb).clip(0, 255).astype(np.uint8))
+    views = [photograph(n, 0.3 * n, 0.0, gain) for n, gain in enumerate(gains)]
+    places, rgb, _ = painted(mesh, views)
+    near = (places[:, 0] > 2) & (places[:, 0] < 5) & (np.abs(places[:, 1]) < 0.6)
+    off = rgb[near] / colour_at(places[near])
+    x = places[near][:, 0]
+    first, last = np.median(off[x < 3]), np.median(off[x > 4])
+    assert first == pytest.approx(last, rel=0.05)
+
+
+def test_what_is_beside_an_outline_is_not_painted_on_what_is_behind():
+    # A post of 3 cm, less than a triangle, half a metre before the slope, red in all images.
+    mesh = ground()
+    y, z = np.meshgrid([-0.015, 0.015], np.linspace(0.2, 1.5, 40))
+    post = np.stack([np.full(80, 2.5), y.ravel(), z.ravel()], axis=1).astype(np.float32)
+    corner = np.arange(0, 78, 2)
+    around = (corner, corner + 2, corner + 1), (corner + 1, corner + 2, corner + 3)
+    faces = np.concatenate([np.stack(one, axis=1) for one in around]).astype(np.int32)
+    vertices = np.concatenate([mesh.vertices, post])
+    faces = np.concatenate([mesh.faces, faces + np.int32(len(mesh.vertices))])
+    rgb = np.full(vertices.shape, 120, np.uint8)
+    both = TriangleMesh(vertices, faces, vertex_normals(vertices, faces), rgb)
+    views = []
+    for n, y_m in enumerate((-0.5, 0.0, 0.5)):
+        view = photograph(n, 0.5, y_m)
+        u, v, _ = project(apply(invert(view.T_map_camera), post.astype(float)), CAMERA)
+        image = view.image.copy()
+        image[: int(v.max()) + 2, int(u.min()) : int(u.max()) + 2] = [255, 0, 0]
+        views.append(view._replace(image=image))
+    places, found, _ = painted(both, views)
+    slope = (np.abs(places[:, 2] - 0.1 * places[:, 0]) < 1e-3) & (places[:, 0] > 3)
+    behind = slope & (places[:, 0] < 4) & (np.abs(places[:, 1]) < 0.6)
+    red = (found[:, 0] > 100) & (found[:, 1] < 30)
+    assert behind.sum() > 100
+    assert not red[behind].any()
+    assert np.median(np.abs(found - colour_at(places))[behind]) < 15
+    assert red[(np.abs(places[:, 0] - 2.5) < 1e-3) & (np.abs(places[:, 1]) < 0.02)].any()
+
+
+def test_crumbs_of_a_rough_surface_join_larger_charts_and_hide_nothing():
+    mesh, random = ground(), np.random.default_rng(0)
+    rough = mesh.vertices + random.normal(0, 0.08, mesh.vertices.shape).astype(np.float32)
+    mesh = replace(mesh, vertices=rough)
+    atlas = make_atlas(mesh, 0.01, 4096)
+    surface = charts._directions(mesh)
+    own, joined = charts._kinds(mesh, surface, 0.01)
+    before, after = (len(np.unique(charts._charts(surface.pairs, k))) for k in (own, joined))
+    assert after < 0.8 * before
+    overlapping = charts._laid_out(mesh, surface.pairs, joined, 0.01)
+    assert hidden_faces(atlas) < hidden_faces(overlapping) / 2
+
+
+def hidden_faces(atlas: charts.Atlas) -> int:
+    _, found = texels_of(atlas)
+    shown, area = np.bincount(found, minlength=len(atlas.mesh.faces)), np.abs(atlas.sides[-1]) / 2
+    return int(((area > 20) & (shown < 0.5 * area)).sum())

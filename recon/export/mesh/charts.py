@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,10 @@ _DOWN: Final = np.array([[0, 0, -1], [0, 0, -1], [0, -1, 0], [0, 0, -1], [0, 0, 
 _FACING: Final = np.concatenate([np.eye(3), -np.eye(3)])
 _SLANTED: Final = 0.3  # least cosine to the axis of a chart: texels are stretched three times there
 _SMOOTHINGS: Final = 3  # rounds in which faces join the charts of their neighbours
+_CRUMB_PX: Final = 64  # a chart that covers less than a square as wide joins another, if it can,
+_JOININGS: Final = 6  # in so many rounds,
+_ASLANT: Final = 0.1  # as far as its cosines allow: few of its texels are ever seen
+_SHOWN: Final = 0.7  # of the area of a face, texels: with fewer, another one of its chart hides it
 _BLOCK_PX: Final = 256  # charts are cut into blocks as wide, to fit closely side by side
 MARGIN_PX: Final = 2  # around a chart, painted with what is next to it
 _ROWS: Final = 256  # of texels that are located at a time
@@ -53,11 +57,15 @@ def make_atlas(mesh: TriangleMesh, texel_m: float, most_px: int) -> Atlas:
     Raises:
         MeshingError: They would be wider than its triangles: vertices show as much.
     """
-    facing, pairs = _directions(mesh)
+    surface = _directions(mesh)
     a, b = mesh.vertices[mesh.faces[:, :2]].transpose(1, 0, 2)
     widest_m = max(texel_m, float(np.median(np.linalg.norm(b - a, axis=1))))
     while True:
-        atlas = _laid_out(mesh, facing, pairs, texel_m)
+        own, kind = _kinds(mesh, surface, texel_m)
+        atlas = _laid_out(mesh, surface.pairs, kind, texel_m)
+        if max(atlas.width_px, atlas.height_px) <= most_px:
+            kind = _apart(atlas, surface.pairs, own, kind)
+            atlas = _laid_out(mesh, surface.pairs, kind, texel_m)
         most = max(atlas.width_px, atlas.height_px)
         if most <= most_px:
             return atlas
@@ -93,12 +101,20 @@ def ratios_of(atlas: Atlas, numbers: Int32, faces: Int32) -> Float32:
     return np.asarray(np.clip(ratios, 0, 1), np.float32)
 
 
-def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:
-    """Return int64 (F,), by which axis each face is seen; and pairs (P, 2) that share an edge."""
+class _Surface(NamedTuple):
+    """Faces as charts are made of them."""
+
+    pairs: Int64  # (P, 2), those that share an edge
+    facing: Int64  # (F,), by which axis each is seen
+    cosines: Float64  # (F, 6), how much it faces each axis
+    area: Float64  # (F,)
+
+
+def _directions(mesh: TriangleMesh) -> _Surface:
     a, b, c = mesh.vertices[mesh.faces].astype(np.float64).transpose(1, 0, 2)
     normals = np.cross(b - a, c - a)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    cosines = normals @ _FACING.T
+    double = np.linalg.norm(normals, axis=1)
+    cosines = normals @ _FACING.T / np.maximum(double, 1e-30)[:, None]
     facing, pairs, rows = cosines.argmax(axis=1), meeting_sides(mesh.faces) // 3, np.arange(len(a))
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     for _ in range(_SMOOTHINGS):
@@ -106,15 +122,54 @@ def _directions(mesh: TriangleMesh) -> tuple[Int64, Int64]:
         votes = votes.reshape(-1, 6).astype(np.float64)
         votes[rows, facing] += 0.5  # of two that are equal, its own
         facing = np.where(cosines >= _SLANTED, votes, -1).argmax(axis=1)
-    return facing, pairs
+    return _Surface(pairs, facing, cosines, double / 2)
 
 
-def _laid_out(mesh: TriangleMesh, facing: Int64, pairs: Int64, texel_m: float) -> Atlas:
+def _kinds(mesh: TriangleMesh, surface: _Surface, texel_m: float) -> tuple[Int64, Int64]:
+    """Return int64 (F,), six times its block and the axis that each face is seen by: two of them.
+
+    Those that meet and have the same one are a chart. In the second, crumbs joined other charts.
+    """
+    pairs, facing, cosines, area = surface
     middles = mesh.vertices[mesh.faces].mean(axis=1)
     block = np.floor(middles / (_BLOCK_PX * texel_m)).astype(np.int64)
-    one, other = pairs.T
-    joined = (facing[one] == facing[other]) & (block[one] == block[other]).all(axis=1)
-    chart_of_face = components(pairs[joined], len(facing))
+    own = kind = np.unique(block, axis=0, return_inverse=True)[1].ravel() * 6 + facing
+    ends = np.concatenate([pairs, pairs[:, ::-1]])
+    for _ in range(_JOININGS):
+        chart = _charts(pairs, kind)
+        size = np.bincount(chart, area)
+        begin, end = chart[ends].T
+        joins = (size[begin] < (_CRUMB_PX * texel_m) ** 2) & (size[end] > size[begin])
+        order = np.flatnonzero(joins)[np.argsort(size[end[joins]], kind="stable")]
+        # The last assignment holds: of those that a crumb meets, the largest.
+        into = np.full(len(size), -1)
+        into[begin[order]] = kind[ends[order, 1]]
+        into = into[chart]
+        joins = (into >= 0) & (cosines[np.arange(len(into)), into % 6] >= _ASLANT)
+        kind = np.where(joins, into, kind)
+    return own, kind
+
+
+def _charts(pairs: Int64, kind: Int64) -> Int32:
+    return components(pairs[kind[pairs[:, 0]] == kind[pairs[:, 1]]], len(kind))
+
+
+def _apart(atlas: Atlas, pairs: Int64, own: Int64, kind: Int64) -> Int64:
+    """Return the kinds of faces, crumbs as before they joined charts that they overlap with."""
+    numbers, faces = texels_of(atlas)
+    shown, area = np.bincount(faces, minlength=len(kind)), np.abs(atlas.sides[-1]) / 2
+    hidden = np.flatnonzero((area > 3) & (shown < _SHOWN * area))
+    front = np.full(atlas.width_px * atlas.height_px, -1, np.int32)
+    front[numbers] = faces
+    column, row = atlas.places[atlas.mesh.faces[hidden]].mean(axis=1).astype(np.int64).T
+    joined = kind != own
+    guilty = np.where(joined[hidden], hidden, front[row * atlas.width_px + column])
+    chart = _charts(pairs, own)
+    return np.where(np.isin(chart, chart[guilty[guilty >= 0]]), own, kind)
+
+
+def _laid_out(mesh: TriangleMesh, pairs: Int64, kind: Int64, texel_m: float) -> Atlas:
+    chart_of_face, facing = _charts(pairs, kind), kind % 6
     charts = int(chart_of_face.max()) + 1
     packed = (chart_of_face.astype(np.int64)[:, None] << 32) | mesh.faces
     keys, faces = np.unique(packed, return_inverse=True)

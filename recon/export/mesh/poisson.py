@@ -68,7 +68,7 @@ class MeshSettings(Settings):
     """Edge of the tiles in which the map of a drive is meshed. Smaller ones take less memory."""
     texture_px: int = Field(8192, ge=64, le=16384)
     """Largest width and height of the picture of a textured map: what graphics cards take. Its
-    texels are as wide as the pixels that saw the surface, wider where that is more."""
+    texels are 0.7 times as wide as the pixels that saw the surface, wider where that is more."""
 
     @model_validator(mode="after")
     def _check_solid(self) -> Self:
