@@ -39,8 +39,8 @@ def context_of(map_: recon.Map, survey: Georeference | None = None) -> ExportCon
 
 
 def there(crs: str | None) -> Georeference:
-    turn, middle_m = np.eye(3), np.zeros(3)
-    return Georeference(T_SURVEY_MAP, crs, np.zeros((1, 3)), 10.0, 1.0, 0, (), turn, 0.1, middle_m, 0.1)
+    turn, fit = np.eye(3), (np.zeros((1, 3)), 10.0, 1.0, 0, ())
+    return Georeference(T_SURVEY_MAP, crs, *fit, turn, 0.1, np.zeros(3), 0.1)
 
 
 def drawn(folder: Path) -> np.ndarray:
