@@ -277,6 +277,9 @@ class ExportSummary(RunSummary):
             if name in self.products:
                 file = shown_path(out, PRODUCTS[name].name)
                 return f"ros2 run nav2_map_server map_server --ros-args -p yaml_filename:={file}"
+        if "web" in self.products:
+            folder = shown_path(out, PRODUCTS["web"].name)
+            return f"python -m http.server --bind 127.0.0.1 --directory {folder}"
         return f"recon view {shown_path(self.run)}"
 
 
