@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
-from recon.core.values import PointCloud, join_clouds
+from recon.core.values import PointCloud, RectifiedCamera, join_clouds
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.camera import project
 from recon.export.growing import submap_cloud
@@ -24,7 +24,7 @@ from recon.export.product import open_images
 from recon.io.files import read_text, reading
 from recon.io.models.mesh import read_mesh
 from recon.map.ground.grid import flatten
-from recon.map.ground.surface import estimate_ground_surface
+from recon.map.ground.surface import GroundSurface, estimate_ground_surface
 from recon.map.localize.localizer import State
 from recon.map.map import Map
 from recon.map.sessions.placed import settings_of
@@ -47,11 +47,25 @@ _BEHIND_PX: Final = 1.0  # less disparity than was matched there: a place is hid
 def finish(run: Path, scene: Scene) -> Iterator[Scene]:
     """Add to what the files of a finished run show what its map knows, step by step."""
     map_ = Map.open(run)  # as long as its keyframes are looked at
+    named = ((one.number, one.info.source, one.date.text[:10]) for one in map_.linked)
+    drives = [f"Drive {number}: {name} {date}".rstrip() for number, name, date in named]
     scene = replace(scene, paths=_paths(map_), keyframes=KeyframeViews(map_))
+    scene = replace(scene, lines=[*scene.lines, *drives])
     yield scene
+    if scene.points and scene.grids:
+        scene = replace(scene, grids=((scene.grids[0][0], _ground(map_, scene)),))
     file = run / "mesh" / "mesh.ply"
     mesh = thin_mesh(read_mesh(file), _MOST_FACES) if file.is_file() else None
     yield replace(scene, mesh=mesh, points=_dated(scene.points, scene.paths))
+
+
+def _ground(map_: Map, scene: Scene) -> GroundSurface:
+    """Return the ground below the paths of a map, by its points."""
+    settings, gap = settings_of(map_.first), np.full((1, 3), np.nan)
+    pieces = [piece for path in scene.paths for piece in (path.cloud.xyz, gap)]
+    cloud = join_clouds(part.cloud for part in scene.points)
+    reach_m = settings.occupancy.max_range_m
+    return estimate_ground_surface(cloud, np.concatenate(pieces), settings.ground, reach_m)
 
 
 def _paths(map_: Map) -> tuple[Points, ...]:
@@ -146,9 +160,8 @@ def _submap(map_: Map, number: int) -> Scene:
     voxels = submap.occupancy.voxels(settings.occupancy.resolution_m)
     path_m = apply(T, drive.odometry.positions_m[submap.first_frame :][: submap.frames])
     ground = estimate_ground_surface(cloud, path_m, settings.ground, settings.occupancy.max_range_m)
-    height_m = float(path_m[:, 2].mean() - np.nan_to_num(ground.camera_height_m))
     points = _dated([Points(f"{number}", cloud)], _paths(map_))
-    return Scene(points, grids=((flatten(voxels, ground, settings.grid), height_m),))
+    return Scene(points, grids=((flatten(voxels, ground, settings.grid), ground),))
 
 
 class KeyframeViews:
@@ -159,6 +172,9 @@ class KeyframeViews:
         self._opened: dict[int, tuple[StereoSource, FrameReconstructor]] = {}
         T, paths = map_.first.T_map_world, map_.paths
         self.T_map_camera = [T @ paths[n].T_world_camera[frame] for n, frame in self._views.keys]
+
+    def camera(self, number: int) -> RectifiedCamera:
+        return self._map.session(self._views.keys[number][0]).camera
 
     def sees(self, number: int, place_m: Float64) -> bool:
         """Return whether a keyframe has a place (3,), map axes, in view, with nothing before it."""

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 from threading import Event
 from typing import Any, Final
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from recon.core.errors import require
+from recon.core.geometry.se3 import quaternion_from_rotation
+from recon.core.text import counted
 from recon.core.values import UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64
+from recon.map.ground.surface import GroundSurface
 from recon.report.scene import (
     COLOURINGS,
     Points,
@@ -24,16 +30,23 @@ from recon.report.scene import (
     near_others,
 )
 from recon.view.guard import Guard, stop
+from recon.view.tools import LIMITS, TOOLS, Limits, ends_of, measure, within
 
 MOST_POINTS: Final = 1_500_000  # in the browser: about 25 MB
 FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
 _TILE_VOXELS: Final = 256  # edge of what is thinned together
 _CLICK_RAD: Final = 0.006  # about five pixels of a screen
 _HALF_VIEW: Final = (0.9, 0.7)  # tangents across and up of what viser's page has in view at first
-# Shown at first. A grid is flat, and the ground is not: behind a bend it would hide the road.
-_LAYERS: Final = {"cloud": True, "grid": False, "mesh": False, "path": True}
+_MOST_CAMERAS: Final = 36  # that are drawn
+_MOST_TEXELS: Final = 4096  # across an image of a grid: what every browser can show
+_GRID_CELLS: Final = 256  # across the surface that carries it, at most
+_STEP: Final = 0.01  # of limits, metres or seconds
+_SEEN_BY: Final = "who saw it"
+_LAYERS: Final = {"cloud": True, "grid": False, "mesh": False, "path": True, "cameras": True}
 _FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
 _LINE: Final[Any] = {"thickness": 3.0, "thickness_units": "screen"}
+_YELLOW: Final = (255, 213, 79)
+_ENDS: Final = (slice(None, -1), slice(1, None))
 
 
 class Viewer:
@@ -51,7 +64,10 @@ class Viewer:
         self.looked_at = False  # by a browser
         self._scenes: dict[Path, Scene] = {}
         self._parts: list[Points] = []
+        self._shown: dict[str, tuple[Points, Any]] = {}  # within limits, and their colours
+        self._places: list[PointCloud] = []  # that were clicked to measure, of one point each
         self._keyframes: list[tuple[Any, int]] = []  # each by its views, and its number there
+        self._cameras = Points("", PointCloud(np.zeros((0, 3), np.float32)))  # that are drawn
         self._known: list[str] = [*COLOURINGS[:1]]  # of colourings
         self._drawn: dict[str, tuple[Any, ...]] = {}  # what each node was made of
         self._eye_m: Float64 = np.zeros(3)
@@ -75,6 +91,10 @@ class Viewer:
         self._by.options = self._known
         self._text.content = "<br>".join(_html(one.lines) for one in scenes)
         self._slider.max, self._slider.disabled = max(1, last), last < 0
+        for by, limits in self._limited().items():
+            (low, high), one = ends_of(self._parts, by), self._limits[by]
+            one.min, one.max, one.disabled = float(low), max(high, low + 1.0), low == high
+            one.value = tuple(np.clip(limits, one.min, one.max).tolist())
         self._draw()
 
     def serve(self, seconds: float) -> None:
@@ -84,9 +104,12 @@ class Viewer:
         wanted = {name: self._wanted.pop(name) for name in [*self._wanted]}
         self._eye_m = wanted.get("eye", self._eye_m)
         self.looked_at |= "eye" in wanted
-        place_m = pick(self._parts, *wanted["ray"]) if "ray" in wanted else None
-        if self._keyframes and (place_m is not None or "keyframe" in wanted):
-            self._choose(wanted.get("keyframe"), place_m)
+        if "clear" in wanted:
+            self._places = []
+        if "ray" in wanted:
+            self._click(*wanted["ray"])
+        if "keyframe" in wanted and self._keyframes:
+            self._choose(wanted["keyframe"], None)
         if wanted:
             self._draw()
 
@@ -99,12 +122,20 @@ class Viewer:
         self._news.set()
 
     def _offers(self, control: Any, value: Any) -> bool:
-        known = self._controls.get(control)
-        if known is None or known is self._by:
-            return known is not None and value in known.options
-        if known is self._slider:
-            return type(value) is int and not known.disabled and 0 <= value <= known.max
-        return type(value) is bool
+        one = self._controls.get(control)
+        if one is None or one.disabled:
+            return False
+        if hasattr(one, "options"):
+            return value in one.options
+        if type(one.value) is bool:  # of a button, too
+            return type(value) is bool
+        given, now = (value, one.value) if isinstance(one.value, tuple) else ([value], [one.value])
+        kinds = {type(now[0]), int}
+        return (
+            (type(given), len(given)) == (list, len(now))
+            and {type(number) for number in given} <= kinds
+            and bool(one.min <= given[0] <= given[-1] <= one.max)
+        )
 
     def _lay_out(self) -> None:
         gui, scene = self._server.gui, self._server.scene
@@ -116,18 +147,38 @@ class Viewer:
             (gui.add_checkbox(f"Show {name}", shown), scene.add_frame(f"/{name}", False))
             for name, shown in _LAYERS.items()
         ]
+        self._size = gui.add_slider("Point size", 0.25, 4.0, 0.25, 1.0)
+        with gui.add_folder("Show only", expand_by_default=False):
+            self._limits = {
+                by: gui.add_multi_slider(name, 0.0, 1.0, step, (0.0, 1.0), disabled=True)
+                for by, name in LIMITS.items()
+                for step in [1.0 if by == "session" else _STEP]
+            }
+        self._tool = gui.add_dropdown("A click shows", (_SEEN_BY, *TOOLS))
+        self._measured = gui.add_html("")
+        clear = gui.add_button("Clear what is measured")
         self._slider = gui.add_slider("Keyframe", 0, 1, 1, 0, disabled=True)
         self._said = gui.add_html(_html(["Move the slider, or click into the scene."]))
         self._image = gui.add_image(np.zeros((1, 1, 3), np.uint8), format="jpeg", visible=False)
-        drawn = (self._by, *(box for box, _ in self._layers))
-        self._controls = {one._impl.uuid: one for one in (*drawn, self._slider)}
+        boxes = [box for box, _ in self._layers]
+        drawn = (self._by, *boxes, self._size, *self._limits.values(), self._tool)
+        self._controls = {one._impl.uuid: one for one in (*drawn, clear, self._slider)}
         for control in drawn:
             control.on_update(lambda _: self._note(drawn=True))
+        clear.on_click(lambda _: self._note(clear=True))
         self._slider.on_update(lambda e: self._note(keyframe=e.client and e.target.value))
         scene.on_click()(lambda e: self._note(ray=np.array([e.ray_origin, e.ray_direction])))
         self._server.on_client_connect(
             lambda client: client.camera.on_update(lambda c: self._note(eye=np.array(c.position)))
         )
+
+    def _limited(self) -> Limits:
+        """Return the limits of points; one at its end lets everything through."""
+        return {
+            by: (low if low > one.min else -np.inf, high if high < one.max else np.inf)
+            for by, one in self._limits.items()
+            for low, high in [one.value]
+        }
 
     def _changed(self, name: str, *made_of: Any) -> bool:
         """Return whether something is to be drawn, as it is made of other values than before."""
@@ -141,34 +192,49 @@ class Viewer:
         # What was chosen may be older than what is known now.
         self._colour = self._by.value if self._by.value in self._known else self._known[0]
         self._kept: set[str] = set()
+        limits = self._limited()
         if self._parts:
-            self._draw_clouds()
+            self._draw_clouds(limits)
         for number, scene in enumerate(self._scenes.values()):
-            self._draw_rest(number, scene)
+            self._draw_rest(number, scene, limits)
+        if self._keyframes:
+            self._draw_cameras()
+        self._measured.content = ""
+        if self._places and self._tool.value in TOOLS:
+            self._draw_measured()
         for name in {*self._drawn} - self._kept:
             self._server.scene.remove_by_name(name)
             del self._drawn[name]
 
-    def _draw_clouds(self) -> None:
+    def _draw_clouds(self, limits: Limits) -> None:
         by, parts, scenes = self._colour, self._parts, enumerate(self._scenes.values())
-        if self._changed("colours", by, *parts):
+        if new := self._changed("colours", by, *parts):
             self._colours, legend = colours(parts, by)
             self._legend.content = _html([legend])
-        halved = halvings(parts, self._eye_m, MOST_POINTS if self.looked_at else FIRST_POINTS)
         named = {f"/cloud/{n}_{part.name}": one for n, one in scenes for part in one.points}
-        for name, part, rgb, times in zip(named, parts, self._colours, halved, strict=True):
+        if self._changed("limits", limits, *parts) or new:
+            keeps = [within(part, limits) for part in parts]
+            self._shown = {
+                name: (part, rgb) if keep.all() else (part.select(keep), rgb[keep])
+                for name, part, rgb, keep in zip(named, parts, self._colours, keeps, strict=True)
+                if keep.any()
+            }
+        most = MOST_POINTS if self.looked_at else FIRST_POINTS
+        halved = halvings([part for part, _ in self._shown.values()], self._eye_m, most)
+        for (name, (part, rgb)), times in zip(self._shown.items(), halved, strict=True):
+            # Fewer points are larger, so that the surface stays closed.
+            size_m = self._size.value * named[name].spacing_m * 2 ** (times / 2)
             if self._changed(name, part, by, times):
                 xyz, shown = part.cloud.xyz[:: 1 << times], rgb[:: 1 << times]
-                # Fewer points are larger, so that the surface stays closed.
-                how = {"point_size": named[name].spacing_m * 2 ** (times / 2), **_FLAT}
-                self._server.scene.add_point_cloud(name, xyz, shown, **how)
+                self._server.scene.add_point_cloud(name, xyz, shown, point_size=size_m, **_FLAT)
+            self._server.scene.get_handle_by_name(name).point_size = size_m
 
-    def _draw_rest(self, number: int, scene: Scene) -> None:
+    def _draw_rest(self, number: int, scene: Scene, limits: Limits) -> None:
         api, by, mesh = self._server.scene, self._colour, scene.mesh
-        for part, (grid, height_m) in enumerate(scene.grids):
+        for part, (grid, ground) in enumerate(scene.grids):
             name = f"/grid/{number}_{part}"
-            if self._changed(name, grid):
-                _add_grid(api, name, grid, height_m + 0.01 * scene.spacing_m * part)
+            if self._changed(name, grid, ground):
+                _add_grid(api, name, grid, ground, scene.spacing_m * (1.0 + 0.01 * part))
         if mesh is not None and self._changed(name := f"/mesh/{number}", mesh):
             trimesh = require("trimesh", extra="view")
             shown = trimesh.Trimesh(
@@ -177,10 +243,63 @@ class Viewer:
             api.add_mesh_trimesh(name, shown)
         for path in scene.paths:
             name = f"/path/{number}_{path.name}"
-            if self._changed(name, path, by):
+            if self._changed(name, path, by, limits):
                 (own,), _ = colours([path], by if by in ("age", "session") else "image")
-                pairs = [np.stack([a[:-1], a[1:]], axis=1) for a in (path.cloud.xyz, own)]
+                keep = within(path, limits)
+                both = keep[:-1] & keep[1:]
+                pairs = [np.stack([a[:-1], a[1:]], axis=1)[both] for a in (path.cloud.xyz, own)]
                 api.add_line_segments(name, *pairs, **_LINE)
+
+    def _draw_cameras(self) -> None:
+        """Draw some keyframes as cameras, small enough to be told apart, to be clicked at."""
+        last = len(self._keyframes) - 1
+        numbers = np.unique(np.linspace(0, last, min(last + 1, _MOST_CAMERAS)).astype(np.int32))
+        known = [
+            (of.T_map_camera[n], of.camera(n))
+            for of, n in map(self._keyframes.__getitem__, numbers)
+        ]
+        eyes_m = np.array([T[:3, 3] for T, _ in known])
+        steps_m = np.linalg.norm(np.diff(eyes_m, axis=0), axis=1)
+        self._camera_m = 0.2 * float(np.median(steps_m)) if last else 0.2
+        self._cameras = Points("", PointCloud(eyes_m.astype(np.float32), session=numbers))
+        for n, (T, camera) in zip(numbers, known, strict=True):
+            if self._changed(name := f"/cameras/{n}", T.tobytes(), self._camera_m):
+                angle = 2.0 * math.atan(camera.height_px / 2.0 / camera.focal_px)
+                wxyz = np.roll(quaternion_from_rotation(T[:3, :3]), 1)
+                how = {"scale": self._camera_m, "wxyz": wxyz, "position": T[:3, 3], **_LINE}
+                aspect = camera.width_px / camera.height_px
+                self._server.scene.add_camera_frustum(name, angle, aspect, color=_YELLOW, **how)
+
+    def _draw_measured(self) -> None:
+        """Show what is measured between the places that were clicked for it."""
+        tool, api = self._tool.value, self._server.scene
+        self._places = self._places[-TOOLS[tool].most :]
+        xyz = np.concatenate([one.xyz for one in self._places]).astype(np.float64)
+        sigma_m = [np.nan if one.sigma_m is None else one.sigma_m[0] for one in self._places]
+        grounds = [ground for one in self._scenes.values() for _, ground in one.grids]
+        below_m = [float(ground.height_at(xyz[-1:, :2])[0]) for ground in grounds]
+        ground_m = next(filter(math.isfinite, below_m), math.nan)
+        self._measured.content = _html(measure(tool, xyz, np.array(sigma_m), ground_m))
+        if self._changed("/measured/lines", tool, *self._places):
+            size_m = 2.0 * max(one.spacing_m for one in self._scenes.values())
+            shown = xyz + np.array([0.0, 0.0, size_m])  # else points around would hide them
+            pairs = np.stack([shown, np.roll(shown, -1, axis=0)], axis=1)
+            pairs = pairs if tool == "area" else pairs[:-1]
+            api.add_line_segments("/measured/lines", pairs, _YELLOW, **_LINE)
+            api.add_point_cloud("/measured/lines/ends", shown, _YELLOW, point_size=size_m)
+
+    def _click(self, origin_m: Float64, direction: Float64) -> None:
+        """Do what the chosen tool does with the point, or a camera, that a ray meets first."""
+        found = pick([part for part, _ in self._shown.values()], origin_m, direction)
+        shown = [self._cameras] if self._layers[-1][0].value else []
+        camera = pick(shown, origin_m, direction, self._camera_m)
+        if self._tool.value in TOOLS:
+            self._places += [] if found is None else [found]
+        elif camera is not None and camera.session is not None:
+            self._slider.value = keyframe = int(camera.session[0])
+            self._choose(keyframe, None)
+        elif found is not None and self._keyframes:
+            self._choose(None, found.xyz[0].astype(np.float64))
 
     def _choose(self, keyframe: int | None, place_m: Float64 | None) -> None:
         """Show a keyframe and who saw it, or a place and the nearest keyframe that saw that."""
@@ -190,8 +309,10 @@ class Viewer:
         place_m = eyes_m[keyframe] if place_m is None else place_m
         seen = [k for k, (of, n) in enumerate(known) if of.sees(n, place_m)]
         ends = np.array([(place_m, eyes_m[k]) for k in seen]).reshape(-1, 2, 3)
-        api.add_line_segments("/path/seen", ends, (255, 213, 79), **_LINE)
-        lines = [f"{np.round(place_m, 1)} m was seen by keyframes {seen or 'none'}"]
+        api.add_line_segments("/path/seen", ends, _YELLOW, **_LINE)
+        where = ", ".join(f"{metre:.1f}" for metre in place_m)
+        by = f"{counted(len(seen), 'keyframe')}: {', '.join(map(str, seen))}" if seen else "none"
+        lines = [f"The place at {where} m was seen by {by}"]
         if keyframe is None and seen:
             keyframe = min(seen, key=lambda k: float(np.linalg.norm(eyes_m[k] - place_m)))
             self._slider.value = keyframe
@@ -213,6 +334,8 @@ def cut(cloud: PointCloud, spacing_m: float) -> tuple[Points, ...]:
 
 def halvings(parts: Sequence[Points], eye_m: Float64, limit: int = MOST_POINTS) -> list[int]:
     """Return how often to halve each part to keep ``limit``: two more at twice the distance."""
+    if not parts:
+        return []
     sizes = np.array([len(part.cloud) for part in parts])
     places = np.array([part.cloud.xyz[len(part.cloud) // 2] for part in parts])
     distance_m = np.maximum(np.linalg.norm(places - eye_m, axis=1), 1e-3)
@@ -223,16 +346,18 @@ def halvings(parts: Sequence[Points], eye_m: Float64, limit: int = MOST_POINTS) 
     return [int(number) for number in times]
 
 
-def pick(parts: Sequence[Points], origin_m: Float64, direction: Float64) -> Float64 | None:
-    """Return the nearest point (3,) that a ray passes close by; None where there is none."""
+def pick(
+    parts: Sequence[Points], origin_m: Float64, direction: Float64, radius_m: float = 0.0
+) -> PointCloud | None:
+    """Return the nearest point, alone, that a ray passes close by; None where there is none."""
     best_m, best = np.inf, None
     for part in parts:
         xyz = part.cloud.xyz - origin_m
         along_m = xyz @ direction
         aside_m = np.linalg.norm(xyz - along_m[:, None] * direction, axis=1)
-        along_m[aside_m > _CLICK_RAD * along_m] = np.inf
-        if along_m.min() < best_m:
-            best_m, best = along_m.min(), part.cloud.xyz[along_m.argmin()].astype(np.float64)
+        along_m[(aside_m > np.maximum(_CLICK_RAD * along_m, radius_m)) | (along_m < 0.0)] = np.inf
+        if along_m.min(initial=np.inf) < best_m:
+            best_m, best = along_m.min(), part.cloud.select(np.array([along_m.argmin()]))
     return best
 
 
@@ -242,12 +367,39 @@ def _html(lines: Iterable[str]) -> str:
     return f'<div style="padding: 0 10px; font-size: 14px; overflow-wrap: anywhere">{text}</div>'
 
 
-def _add_grid(api: Any, name: str, grid: OccupancyGrid, height_m: float) -> None:
-    from recon.report.style import colour_grid  # noqa: PLC0415 - not for the first points
+def _add_grid(
+    api: Any, name: str, grid: OccupancyGrid, ground: GroundSurface, above_m: float
+) -> None:
+    """Drape a grid over the ground, a little above it: an image on a surface."""
+    from PIL import Image  # noqa: PLC0415 - not for the first points
 
+    from recon.report.style import colour_grid  # noqa: PLC0415
+
+    trimesh = require("trimesh", extra="view")
     size_m = np.array(grid.cells.shape[::-1]) * grid.resolution_m
-    known = np.where(grid.cells[::-1] == UNKNOWN, 0, 255).astype(np.uint8)
-    image, middle_m = np.dstack([colour_grid(grid), known]), np.array(grid.origin_m) + size_m / 2
-    # viser shows images from behind, with y down.
-    position_m = (*middle_m, height_m)
-    api.add_image(name, image, *size_m.tolist(), wxyz=(0.0, 1.0, 0.0, 0.0), position=position_m)
+    counts = np.ceil(size_m / max(ground.cell_m, size_m.max() / _GRID_CELLS)).astype(int)
+    u, v = (each.ravel() for each in np.meshgrid(*(np.linspace(0, 1, n + 1) for n in counts)))
+    xy = grid.origin_m + np.column_stack([u, v]) * size_m
+    z = ground.height_at(xy)
+    known = np.isfinite(z)
+    if not known.any():
+        return
+    z[~known] = z[known][cKDTree(xy[known]).query(xy[~known])[1]]
+    corner = np.arange(len(z)).reshape(counts[::-1] + 1)
+    a, b, c, d = (corner[rows, columns].ravel() for rows in _ENDS for columns in _ENDS)
+    faces = np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
+    cells, times = grid.cells, -(-max(grid.cells.shape) // _MOST_TEXELS)
+    for axis, count in enumerate(cells.shape):  # one that is occupied counts most
+        cells = np.maximum.reduceat(cells, np.arange(0, count, times), axis=axis)
+    image = colour_grid(replace(grid, cells=cells))
+    shown = np.dstack([image, np.where(cells[::-1] == UNKNOWN, 0, 255).astype(np.uint8)])
+    times = max(1, _MOST_TEXELS // 2 // max(cells.shape))  # else cells would be blurred
+    texture = Image.fromarray(shown.repeat(times, axis=0).repeat(times, axis=1))
+    # Of its own light: the colours of a grid are its values.
+    look = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=[0, 0, 0, 255], baseColorTexture=texture, alphaMode="MASK",
+        emissiveTexture=texture, emissiveFactor=[1.0, 1.0, 1.0], doubleSided=True,
+    )  # fmt: skip
+    visual = trimesh.visual.TextureVisuals(np.column_stack([u, v]), material=look)
+    vertices = np.column_stack([xy, z + above_m])
+    api.add_mesh_trimesh(name, trimesh.Trimesh(vertices, faces, visual=visual, process=False))

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from recon.core.values import PointCloud
+from recon.core.values import PointCloud, RectifiedCamera
 from recon.report.scene import Points, Scene
 from recon.view.server import Viewer
 from tests.scenery import chromium
@@ -62,6 +62,9 @@ class Views:
     """Keyframes that have everything in view."""
 
     T_map_camera = (np.eye(4), np.eye(4))
+
+    def camera(self, _: int) -> RectifiedCamera:
+        return RectifiedCamera(100.0, 49.5, 29.5, 49.5, 0.1, 100, 60)
 
     def sees(self, *_: object) -> bool:
         return True

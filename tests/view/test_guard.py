@@ -193,6 +193,43 @@ def test_what_the_page_sends_is_done(served, protocol):
         assert until(lambda: "keyframe 0" in viewer._said.content)
 
 
+def test_tools_of_the_page_measure_and_choose_points(served, protocol):
+    viewer = served.viewer
+    whole = len(viewer._parts[0].cloud)
+
+    def shown() -> int:
+        return sum(len(part.cloud) for part, _ in viewer._shown.values())
+
+    with joined(served, protocol) as page:
+        page.send(msgspec.msgpack.encode(CAMERA))
+        assert until(lambda: viewer.looked_at)
+        for label, value in (("Point size", 2.5), ("A click shows", "distance")):
+            page.send(msgspec.msgpack.encode(choice(served, label, value)))
+        assert until(lambda: viewer._size.value == 2.5)
+        assert until(lambda: node(viewer, "/cloud/0_0").point_size == pytest.approx(0.25))
+        for count, (x, y, _) in enumerate(viewer._parts[0].cloud.xyz[:2].tolist(), 1):
+            page.send(msgspec.msgpack.encode(CLICK | {"ray_origin": [x, y, -3.0]}))
+            assert until(lambda count=count: len(viewer._places) == count)
+            assert np.hypot(*(viewer._places[-1].xyz[0, :2] - [x, y])) < 0.03
+        assert until(lambda: "distance: 0." in viewer._measured.content)
+        assert node(viewer, "/measured/lines") is not None
+        page.send(msgspec.msgpack.encode(choice(served, "Clear what is measured", value=True)))
+        assert until(lambda: not viewer._measured.content)
+        assert until(lambda: node(viewer, "/measured/lines") is None)
+        page.send(msgspec.msgpack.encode(choice(served, "Forward, x (m)", [0, 0.25])))
+        assert until(lambda: 0.2 * whole < shown() < 0.3 * whole)
+        page.send(msgspec.msgpack.encode(choice(served, "Left, y (m)", [0.0, 0.0])))
+        assert until(lambda: shown() == 0)
+        assert node(viewer, "/cloud/0_0") is None
+        page.send(msgspec.msgpack.encode(choice(served, "Left, y (m)", [0, 1])))
+        page.send(msgspec.msgpack.encode(choice(served, "Forward, x (m)", [0, 1])))
+        assert until(lambda: shown() == whole)
+
+
+def node(viewer: Viewer, name: str) -> object:
+    return viewer._server.scene.get_handle_by_name(name)
+
+
 NAN, FAR = float("nan"), 1e300
 
 
@@ -221,6 +258,18 @@ def hostile(served: Served) -> list[dict]:
         for label in ("Colours", "Show cloud", "Keyframe")
         for value in ("nothing", "age", 2, -1, 1 << 62, 0.5, NAN, None, [], {}, ["image"], b"a")
     ]
+    values += [
+        choice(served, label, value)
+        for label in ("A click shows", "Clear what is measured", "Point size", "Forward, x (m)")
+        for value in ("nothing", 9, -1, 1 << 62, 9.5, NAN, None, [], {}, ["area"], b"a", [1.0])
+    ]
+    values += [
+        choice(served, "Forward, x (m)", value)
+        for value in ([NAN, 0.5], [0.1, NAN], [0.5, 0.1], [-1.0, 0.5], [0.5, FAR], [0.1] * 3,
+                      [True, 1.0], ["0", "1"], [None, 1.0], {"0": 1}, "01", [[0.1], [0.5]])
+    ]  # fmt: skip
+    # Of what nothing is known yet, nothing can be chosen.
+    values += [choice(served, "Drives", [0.0, 0.5]), choice(served, "Drives", [0.0, 1.0])]
     uuid = choice(served, "Colours", "")["uuid"]
     updates = [{"options": []}, {"value": "height", "visible": False}, {}, {"_impl": 1}, [], None]
     return [
@@ -263,8 +312,10 @@ def test_no_message_changes_what_it_may_not_or_ends_the_viewer(served, protocol,
         assert served.ended is None
         assert viewer._by.value == "height"
         assert viewer._slider.value == 0
-        # As at first: the grid would hide the ground where that is not flat.
-        assert [box.value for box, _ in viewer._layers] == [True, False, False, True]
+        assert (viewer._tool.value, viewer._size.value) == ("who saw it", 1.0)
+        assert {one.value for one in viewer._limits.values()} == {(0.0, 1.0)}
+        # As at first.
+        assert [box.value for box, _ in viewer._layers] == [True, False, False, True, True]
         assert viewer._eye_m.tolist() == [1.0, 2.5, 3.0]
         assert "keyframe" not in viewer._said.content
     assert capfd.readouterr() == ("", "")

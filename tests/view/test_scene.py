@@ -1,9 +1,12 @@
-"""Which points are shown of many, and which one a click hits."""
+"""Which points are shown of many, which one a click hits, and how a grid lies on the ground."""
 
 import numpy as np
+import pytest
 
-from recon.core.values import PointCloud
+from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
+from recon.map.ground.surface import GroundSurface
 from recon.report.scene import Points
+from recon.view import server
 from recon.view.server import cut, halvings, pick
 
 
@@ -37,7 +40,67 @@ def test_a_click_finds_the_nearest_point_on_its_ray_or_none():
     parts = [spread(5.0), spread(50.0)]
     for part, number in ((parts[0], 7), (parts[1], 7)):
         aim = part.cloud.xyz[number].astype(np.float64)
-        hit = pick([part], np.zeros(3), aim / np.linalg.norm(aim))
+        (hit,) = pick([part], np.zeros(3), aim / np.linalg.norm(aim)).xyz
         assert np.linalg.norm(np.cross(hit, aim)) / np.linalg.norm(aim) < 0.006 * 51
         assert np.linalg.norm(hit) <= np.linalg.norm(aim) + 1e-6
     assert pick(parts, np.zeros(3), np.array([-1.0, 0.0, 0.0])) is None
+
+
+def test_what_a_ray_passes_within_a_radius_is_hit_and_what_is_behind_it_is_not():
+    part = Points("", PointCloud(np.array([(5, 0.8, 0), (-5, 0, 0)], np.float32)))
+    ray = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    assert pick([part], *ray) is None
+    (hit,) = pick([part], *ray, 1.0).xyz
+    assert hit.tolist() == [5, np.float32(0.8), 0]
+
+
+class Shown:
+    """Takes the mesh that is added to a page."""
+
+    def add_mesh_trimesh(self, name: str, mesh: object) -> None:
+        self.mesh = mesh
+
+
+@pytest.fixture
+def ramp() -> GroundSurface:
+    """Ground that rises by 0.5 m a metre in x, and is not known in the last columns."""
+    x = np.arange(20) + 0.5
+    heights = np.where(x < 16, 0.5 * x, np.nan)
+    return GroundSurface(np.tile(heights, (10, 1)), 1.0, (0.0, 0.0))
+
+
+def test_a_grid_lies_on_the_ground_and_its_cells_at_their_places(ramp):
+    pytest.importorskip("trimesh", reason="the extra view is not installed")
+    cells = np.full((20, 40), UNKNOWN, np.int8)
+    cells[:, :30], cells[4, 11] = FREE, OCCUPIED
+    shown = Shown()
+    server._add_grid(shown, "grid", OccupancyGrid(cells, 0.5, (0.0, 0.0)), ramp, 0.1)
+    mesh = shown.mesh
+    inner = (mesh.vertices[:, 0] > 1) & (mesh.vertices[:, 0] < 15)
+    np.testing.assert_allclose(
+        mesh.vertices[inner, 2], 0.5 * mesh.vertices[inner, 0] + 0.1, atol=1e-9
+    )
+    assert np.isfinite(mesh.vertices).all()
+    assert (mesh.face_normals[:, 2] > 0).all()
+    assert mesh.bounds[:, :2].tolist() == [[0, 0], [20, 10]]
+    image = np.asarray(mesh.visual.material.emissiveTexture)
+
+    def texel(x_m: float, y_m: float) -> list[int]:
+        high, wide = image.shape[:2]
+        return image[int((1 - y_m / 10) * high), int(x_m / 20 * wide)].tolist()
+
+    assert texel(5.7, 2.2)[3] == 255
+    assert texel(5.7, 2.2) != texel(5.2, 2.2) == texel(5.7, 2.7) == texel(14.0, 9.0)
+    assert texel(15.2, 2.2)[3] == 0
+
+
+def test_a_wide_grid_is_an_image_that_browsers_show_in_which_no_obstacle_is_lost(ramp, monkeypatch):
+    pytest.importorskip("trimesh", reason="the extra view is not installed")
+    monkeypatch.setattr(server, "_MOST_TEXELS", 16)
+    cells = np.full((20, 40), FREE, np.int8)
+    cells[7, 13] = OCCUPIED
+    shown = Shown()
+    server._add_grid(shown, "grid", OccupancyGrid(cells, 0.5, (0.0, 0.0)), ramp, 0.0)
+    image = np.asarray(shown.mesh.visual.material.emissiveTexture)
+    assert image.shape == (7, 14, 4)
+    assert (image != image[0, 0]).any(axis=2).sum() == 1
