@@ -8,22 +8,17 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from recon.core.text import with_unit
 from recon.io.files import read_text, reading
 from recon.io.models.ply import read_ply
-from recon.io.models.rasters import read_grid
-from recon.map.ground.surface import GroundSurface
 from recon.map.store.records import check_format, connect
 from recon.report.scene import Scene
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
-from recon.run.finished import CLOUD, GRID, command_of_map, figure_of, states_of
+from recon.run.finished import CLOUD, command_of_map, figure_of, states_of
 from recon.run.run import SUMMARY
 from recon.view.server import Viewer, cut
 
 _TURN_S: Final = 0.2  # between two looks at whether there is anything new
-_ANYWHERE_M: Final = 1e6  # a level ground below all of a map, until its points say more
 _TURNS: Final = 25  # that are waited for a browser
 _FORMATS: Final = {int: "{:,}".format, float: lambda v: f"{float(f'{v:.3g}'):,g}"}
 _FIGURES: Final = {
@@ -88,15 +83,12 @@ def _scenes(run: Path, viewer: Viewer, asked: Path) -> Iterator[Scene | None]:
 
 
 def read_products(run: Path) -> Scene:
-    """Return points, grid and figures of a finished run by its files, which takes a moment."""
-    voxel_m, height_m = (figure_of(run, name) for name in ("voxel_m", "camera_height_m"))
+    """Return points and figures of a finished run by its files, which takes a moment."""
+    voxel_m = figure_of(run, "voxel_m")
     with reading(run / SUMMARY):
         summary = json.loads(read_text(run / SUMMARY, RECORD_BYTES))
-        ground_m = float(summary["T_map_world"][2][3]) - (height_m or 0.0)
         known = {n: v for n in _FIGURES if type(v := summary.get(n)) in _FORMATS}
         lines = [f"{_FIGURES[n]}: {with_unit(_FORMATS[type(v)](v), n)}" for n, v in known.items()]
-    cloud, grid, spacing_m = run / CLOUD, run / GRID, voxel_m or 0.1  # merged: unsaid
+    cloud, spacing_m = run / CLOUD, voxel_m or 0.1  # merged: unsaid
     points = cut(read_ply(cloud), spacing_m) if cloud.is_file() else ()
-    level = GroundSurface(np.full((1, 1), ground_m), _ANYWHERE_M, (-_ANYWHERE_M / 2,) * 2)
-    grids = ((read_grid(grid), level),) if grid.is_file() else ()
-    return Scene(points, grids=grids, lines=[str(run), *lines], spacing_m=spacing_m)
+    return Scene(points, lines=[str(run), *lines], spacing_m=spacing_m)

@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.geometry.se3 import apply, transform_cloud
-from recon.core.values import (
-    ATTRIBUTES,
-    OccupancyGrid,
-    PointCloud,
-    RectifiedCamera,
-    TriangleMesh,
-)
+from recon.core.values import ATTRIBUTES, OccupancyGrid, PointCloud, TriangleMesh
 from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.map.ground.surface import GroundSurface
 
@@ -53,9 +47,6 @@ class Points:
             return self.cloud.arrays.get(_SHOWN[by].name)
         return self.cloud.xyz[:, {"x": 0, "y": 1}.get(by, 2)]
 
-    def select(self, which: NDArray[Any]) -> Points:
-        return Points(self.name, self.cloud.select(which))
-
 
 class Keyframes(Protocol):
     """The keyframes of a map, and what they saw."""
@@ -63,7 +54,9 @@ class Keyframes(Protocol):
     @property
     def T_map_camera(self) -> Sequence[Float64]: ...
 
-    def camera(self, number: int) -> RectifiedCamera: ...
+    def outline(self, number: int, depth_m: float) -> Float64:
+        """Return line segments (N, 2, 3) around what a keyframe has in view up to a depth."""
+        ...
 
     def sees(self, number: int, place_m: Float64) -> bool:
         """Return whether a keyframe has a place (3,) in view, with nothing before it."""

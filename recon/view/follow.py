@@ -16,13 +16,14 @@ from scipy.spatial import cKDTree
 from recon.core.errors import ReconError
 from recon.core.geometry.se3 import apply, invert
 from recon.core.text import counted
-from recon.core.values import PointCloud, RectifiedCamera, join_clouds
+from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Float32, Float64, UInt8
-from recon.core.values.camera import project
+from recon.core.values.camera import project, unproject
 from recon.export.growing import submap_cloud
 from recon.export.product import open_images
 from recon.io.files import read_text, reading
 from recon.io.models.mesh import read_mesh
+from recon.io.models.rasters import read_grid
 from recon.map.ground.grid import flatten
 from recon.map.ground.surface import GroundSurface, estimate_ground_surface
 from recon.map.localize.localizer import State
@@ -32,7 +33,7 @@ from recon.map.store.map_file import MapViews
 from recon.report.scene import Points, Scene, thin_mesh
 from recon.report.style import REASON_LABELS, colour_disparity, colour_reasons, hatch
 from recon.run.directory import state_folder
-from recon.run.finished import STATES, states_of
+from recon.run.finished import GRID, STATES, states_of
 from recon.run.run import SUMMARY
 from recon.sources.source import StereoSource
 from recon.stereo.frame import FrameReconstructor
@@ -52,8 +53,8 @@ def finish(run: Path, scene: Scene) -> Iterator[Scene]:
     scene = replace(scene, paths=_paths(map_), keyframes=KeyframeViews(map_))
     scene = replace(scene, lines=[*scene.lines, *drives])
     yield scene
-    if scene.points and scene.grids:
-        scene = replace(scene, grids=((scene.grids[0][0], _ground(map_, scene)),))
+    if scene.points and (grid := run / GRID).is_file():
+        scene = replace(scene, grids=((read_grid(grid), _ground(map_, scene)),))
     file = run / "mesh" / "mesh.ply"
     mesh = thin_mesh(read_mesh(file), _MOST_FACES) if file.is_file() else None
     yield replace(scene, mesh=mesh, points=_dated(scene.points, scene.paths))
@@ -173,8 +174,15 @@ class KeyframeViews:
         T, paths = map_.first.T_map_world, map_.paths
         self.T_map_camera = [T @ paths[n].T_world_camera[frame] for n, frame in self._views.keys]
 
-    def camera(self, number: int) -> RectifiedCamera:
-        return self._map.session(self._views.keys[number][0]).camera
+    def outline(self, number: int, depth_m: float) -> Float64:
+        """Return line segments (8, 2, 3) around what a keyframe has in view up to a depth."""
+        camera, eye = self._map.session(self._views.keys[number][0]).camera, np.zeros((4, 3))
+        u, v = np.array([(0, 1, 1, 0), (0, 0, 1, 1)]) * [[camera.width_px], [camera.height_px]]
+        corners = unproject(u - 0.5, v - 0.5, np.full(4, depth_m), camera)
+        ends = np.concatenate([eye, corners]), np.concatenate([corners, np.roll(corners, 1, 0)])
+        return apply(self.T_map_camera[number], np.stack(ends, axis=1).reshape(-1, 3)).reshape(
+            -1, 2, 3
+        )
 
     def sees(self, number: int, place_m: Float64) -> bool:
         """Return whether a keyframe has a place (3,), map axes, in view, with nothing before it."""

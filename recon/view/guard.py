@@ -32,10 +32,8 @@ _PATIENCE_S: Final = 20.0  # for a page that takes nothing, or a stranger that a
 _MESSAGE_BYTES: Final = 1 << 14  # of a page: a camera takes 300
 _REFUSED: Final = "this address is not the one that recon printed\n"
 #: Before viser's page begins: it would add the address of its server to its own, and unpack what
-#: sorts splats, of which there are none here and which needs ``eval``. It would ask for textures
-#: that it has, which no page may, where it could not show them as images.
+#: sorts splats, of which there are none here and which needs ``eval``.
 _FIRST: Final = """history.replaceState = () => {};
-createImageBitmap = undefined;
 const ask = fetch;
 fetch = (url, ...how) =>
   `${url}`.startsWith("data:application/wasm") ? new Promise(() => {}) : ask(url, ...how);"""

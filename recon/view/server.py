@@ -5,17 +5,14 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from html import escape
 from pathlib import Path
 from threading import Event
 from typing import Any, Final
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from recon.core.errors import require
-from recon.core.geometry.se3 import quaternion_from_rotation
 from recon.core.text import counted
 from recon.core.values import UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64
@@ -38,15 +35,15 @@ _TILE_VOXELS: Final = 256  # edge of what is thinned together
 _CLICK_RAD: Final = 0.006  # about five pixels of a screen
 _HALF_VIEW: Final = (0.9, 0.7)  # tangents across and up of what viser's page has in view at first
 _MOST_CAMERAS: Final = 36  # that are drawn
-_MOST_TEXELS: Final = 4096  # across an image of a grid: what every browser can show
-_GRID_CELLS: Final = 256  # across the surface that carries it, at most
+_MOST_CELLS: Final = 150_000  # of a grid: about 13 MB
 _STEP: Final = 0.01  # of limits, metres or seconds
+_MOST_PLACES: Final = 100  # of a measurement
 _SEEN_BY: Final = "who saw it"
 _LAYERS: Final = {"cloud": True, "grid": False, "mesh": False, "path": True, "cameras": True}
 _FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
 _LINE: Final[Any] = {"thickness": 3.0, "thickness_units": "screen"}
 _YELLOW: Final = (255, 213, 79)
-_ENDS: Final = (slice(None, -1), slice(1, None))
+_SQUARE: Final = np.array([(0, 0), (1, 0), (1, 1), (0, 1)])
 
 
 class Viewer:
@@ -215,7 +212,9 @@ class Viewer:
         if self._changed("limits", limits, *parts) or new:
             keeps = [within(part, limits) for part in parts]
             self._shown = {
-                name: (part, rgb) if keep.all() else (part.select(keep), rgb[keep])
+                name: (part, rgb)
+                if keep.all()
+                else (Points(part.name, part.cloud.select(keep)), rgb[keep])
                 for name, part, rgb, keep in zip(named, parts, self._colours, keeps, strict=True)
                 if keep.any()
             }
@@ -234,13 +233,9 @@ class Viewer:
         for part, (grid, ground) in enumerate(scene.grids):
             name = f"/grid/{number}_{part}"
             if self._changed(name, grid, ground):
-                _add_grid(api, name, grid, ground, scene.spacing_m * (1.0 + 0.01 * part))
+                _add_grid(api, name, grid, ground)
         if mesh is not None and self._changed(name := f"/mesh/{number}", mesh):
-            trimesh = require("trimesh", extra="view")
-            shown = trimesh.Trimesh(
-                mesh.vertices, mesh.faces, vertex_colors=mesh.rgb, process=False
-            )
-            api.add_mesh_trimesh(name, shown)
+            _add_mesh(api, name, mesh.vertices, mesh.faces, mesh.rgb)
         for path in scene.paths:
             name = f"/path/{number}_{path.name}"
             if self._changed(name, path, by, limits):
@@ -254,26 +249,18 @@ class Viewer:
         """Draw some keyframes as cameras, small enough to be told apart, to be clicked at."""
         last = len(self._keyframes) - 1
         numbers = np.unique(np.linspace(0, last, min(last + 1, _MOST_CAMERAS)).astype(np.int32))
-        known = [
-            (of.T_map_camera[n], of.camera(n))
-            for of, n in map(self._keyframes.__getitem__, numbers)
-        ]
-        eyes_m = np.array([T[:3, 3] for T, _ in known])
-        steps_m = np.linalg.norm(np.diff(eyes_m, axis=0), axis=1)
-        self._camera_m = 0.2 * float(np.median(steps_m)) if last else 0.2
-        self._cameras = Points("", PointCloud(eyes_m.astype(np.float32), session=numbers))
-        for n, (T, camera) in zip(numbers, known, strict=True):
-            if self._changed(name := f"/cameras/{n}", T.tobytes(), self._camera_m):
-                angle = 2.0 * math.atan(camera.height_px / 2.0 / camera.focal_px)
-                wxyz = np.roll(quaternion_from_rotation(T[:3, :3]), 1)
-                how = {"scale": self._camera_m, "wxyz": wxyz, "position": T[:3, 3], **_LINE}
-                aspect = camera.width_px / camera.height_px
-                self._server.scene.add_camera_frustum(name, angle, aspect, color=_YELLOW, **how)
+        known = [self._keyframes[n] for n in numbers]
+        if self._changed("/cameras/all", *known):
+            eyes_m = np.array([of.T_map_camera[n][:3, 3] for of, n in known])
+            steps_m = np.linalg.norm(np.diff(eyes_m, axis=0), axis=1)
+            self._camera_m = 0.3 * float(np.median(steps_m)) if last else 0.3
+            self._cameras = Points("", PointCloud(eyes_m.astype(np.float32), session=numbers))
+            lines = np.concatenate([of.outline(n, self._camera_m) for of, n in known])
+            self._server.scene.add_line_segments("/cameras/all", lines, _YELLOW, **_LINE)
 
     def _draw_measured(self) -> None:
         """Show what is measured between the places that were clicked for it."""
         tool, api = self._tool.value, self._server.scene
-        self._places = self._places[-TOOLS[tool].most :]
         xyz = np.concatenate([one.xyz for one in self._places]).astype(np.float64)
         sigma_m = [np.nan if one.sigma_m is None else one.sigma_m[0] for one in self._places]
         grounds = [ground for one in self._scenes.values() for _, ground in one.grids]
@@ -284,7 +271,7 @@ class Viewer:
             size_m = 2.0 * max(one.spacing_m for one in self._scenes.values())
             shown = xyz + np.array([0.0, 0.0, size_m])  # else points around would hide them
             pairs = np.stack([shown, np.roll(shown, -1, axis=0)], axis=1)
-            pairs = pairs if tool == "area" else pairs[:-1]
+            pairs = pairs[: {"distance": len(pairs) - 1, "height": 0}.get(tool)]
             api.add_line_segments("/measured/lines", pairs, _YELLOW, **_LINE)
             api.add_point_cloud("/measured/lines/ends", shown, _YELLOW, point_size=size_m)
 
@@ -294,7 +281,7 @@ class Viewer:
         shown = [self._cameras] if self._layers[-1][0].value else []
         camera = pick(shown, origin_m, direction, self._camera_m)
         if self._tool.value in TOOLS:
-            self._places += [] if found is None else [found]
+            self._places += [] if found is None or len(self._places) >= _MOST_PLACES else [found]
         elif camera is not None and camera.session is not None:
             self._slider.value = keyframe = int(camera.session[0])
             self._choose(keyframe, None)
@@ -367,39 +354,28 @@ def _html(lines: Iterable[str]) -> str:
     return f'<div style="padding: 0 10px; font-size: 14px; overflow-wrap: anywhere">{text}</div>'
 
 
-def _add_grid(
-    api: Any, name: str, grid: OccupancyGrid, ground: GroundSurface, above_m: float
-) -> None:
-    """Drape a grid over the ground, a little above it: an image on a surface."""
-    from PIL import Image  # noqa: PLC0415 - not for the first points
+def _add_grid(api: Any, name: str, grid: OccupancyGrid, ground: GroundSurface) -> None:
+    """Drape a grid over the ground, the cells that are known: those of a large one are merged."""
+    from recon.report.style import colour_grid  # noqa: PLC0415 - not for the first points
 
-    from recon.report.style import colour_grid  # noqa: PLC0415
+    while (grid.cells != UNKNOWN).sum() > _MOST_CELLS:
+        cells = grid.cells  # an occupied one counts most, an unknown one least
+        for axis in (0, 1):
+            cells = np.maximum.reduceat(cells, np.arange(0, cells.shape[axis], 2), axis=axis)
+        grid = OccupancyGrid(cells, 2.0 * grid.resolution_m, grid.origin_m)
+    row, column = np.nonzero(grid.cells != UNKNOWN)
+    corners = np.column_stack([column, row])[:, None] + _SQUARE
+    xy = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)
+    xy = grid.origin_m + grid.resolution_m * xy
+    z = ground.height_at(xy.reshape(-1, 2)).reshape(-1, 5) + grid.resolution_m / 2
+    z = np.where(np.isfinite(z), z, z[:, 4:])[:, :4]  # of the middle, at the edge of the ground
+    known = np.isfinite(z).all(axis=1)
+    xyz = np.dstack([xy[:, :4], z])[known].reshape(-1, 3)
+    faces = np.arange(len(xyz)).reshape(-1, 4)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    rgb = colour_grid(grid)[::-1][row, column][known].repeat(4, axis=0)
+    _add_mesh(api, name, xyz, faces, rgb)
 
+
+def _add_mesh(api: Any, name: str, xyz: Any, faces: Any, rgb: Any) -> None:
     trimesh = require("trimesh", extra="view")
-    size_m = np.array(grid.cells.shape[::-1]) * grid.resolution_m
-    counts = np.ceil(size_m / max(ground.cell_m, size_m.max() / _GRID_CELLS)).astype(int)
-    u, v = (each.ravel() for each in np.meshgrid(*(np.linspace(0, 1, n + 1) for n in counts)))
-    xy = grid.origin_m + np.column_stack([u, v]) * size_m
-    z = ground.height_at(xy)
-    known = np.isfinite(z)
-    if not known.any():
-        return
-    z[~known] = z[known][cKDTree(xy[known]).query(xy[~known])[1]]
-    corner = np.arange(len(z)).reshape(counts[::-1] + 1)
-    a, b, c, d = (corner[rows, columns].ravel() for rows in _ENDS for columns in _ENDS)
-    faces = np.concatenate([np.column_stack([a, b, d]), np.column_stack([a, d, c])])
-    cells, times = grid.cells, -(-max(grid.cells.shape) // _MOST_TEXELS)
-    for axis, count in enumerate(cells.shape):  # one that is occupied counts most
-        cells = np.maximum.reduceat(cells, np.arange(0, count, times), axis=axis)
-    image = colour_grid(replace(grid, cells=cells))
-    shown = np.dstack([image, np.where(cells[::-1] == UNKNOWN, 0, 255).astype(np.uint8)])
-    times = max(1, _MOST_TEXELS // 2 // max(cells.shape))  # else cells would be blurred
-    texture = Image.fromarray(shown.repeat(times, axis=0).repeat(times, axis=1))
-    # Of its own light: the colours of a grid are its values.
-    look = trimesh.visual.material.PBRMaterial(
-        baseColorFactor=[0, 0, 0, 255], baseColorTexture=texture, alphaMode="MASK",
-        emissiveTexture=texture, emissiveFactor=[1.0, 1.0, 1.0], doubleSided=True,
-    )  # fmt: skip
-    visual = trimesh.visual.TextureVisuals(np.column_stack([u, v]), material=look)
-    vertices = np.column_stack([xy, z + above_m])
-    api.add_mesh_trimesh(name, trimesh.Trimesh(vertices, faces, visual=visual, process=False))
+    api.add_mesh_trimesh(name, trimesh.Trimesh(xyz, faces, vertex_colors=rgb, process=False))

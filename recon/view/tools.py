@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -30,22 +30,15 @@ def _area(m: Float64) -> float:
     return float(np.linalg.norm(np.cross(m - m[0], np.roll(m, -1, axis=0) - m[0]).sum(axis=0)) / 2)
 
 
-class Tool(NamedTuple):
-    """What clicks measure: figures of places (N, 3) and the height of the ground at the last."""
-
-    fewest: int
-    most: int  # places
-    unit: str
-    figures: Mapping[str, Callable[[Float64, float], float]]
-
-
-TOOLS: Final = {
-    "distance": Tool(2, 100, "m", {
+#: By tool, the fewest places that it needs, and its figures of places (N, 3) and of the height of
+#: the ground at the last of them.
+TOOLS: Final[Mapping[str, tuple[int, Mapping[str, Callable[[Float64, float], float]]]]] = {
+    "distance": (2, {
         "distance": lambda m, _: _path(m), "horizontal": lambda m, _: _path(m * _LEVEL),
         "height difference": lambda m, _: m[-1, 2] - m[0, 2],
     }),
-    "height": Tool(1, 1, "m", {"above the ground": lambda m, ground_m: m[-1, 2] - ground_m}),
-    "area": Tool(3, 100, "m²", {
+    "height": (1, {"above the ground": lambda m, ground_m: m[-1, 2] - ground_m}),
+    "area": (3, {
         "area": lambda m, _: _area(m), "seen from above": lambda m, _: _area(m * _LEVEL),
     }),
 }  # fmt: skip
@@ -57,7 +50,7 @@ def measure(tool: str, places_m: Float64, sigma_m: Float64, ground_m: float) -> 
     Each is followed by its standard deviation, where those of the places, ``sigma_m`` (N,), are
     known: in whatever direction counts. NaN of them, or of ``ground_m``, is unknown.
     """
-    fewest, _, unit, figures = TOOLS[tool]
+    (fewest, figures), unit = TOOLS[tool], "m²" if tool == "area" else "m"
     if len(places_m) < fewest:
         return [f"{len(places_m)} of {counted(fewest, 'place')} clicked"]
     steps, lines = _STEP_M * np.eye(places_m.size).reshape(-1, *places_m.shape), []

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from recon.core.values import PointCloud, RectifiedCamera
+from recon.core.values import PointCloud
 from recon.report.scene import Points, Scene
 from recon.view.server import Viewer
 from tests.scenery import chromium
@@ -63,8 +63,8 @@ class Views:
 
     T_map_camera = (np.eye(4), np.eye(4))
 
-    def camera(self, _: int) -> RectifiedCamera:
-        return RectifiedCamera(100.0, 49.5, 29.5, 49.5, 0.1, 100, 60)
+    def outline(self, _: int, depth_m: float) -> np.ndarray:
+        return np.array([[(0.0, 0.0, 0.0), (0.0, 0.0, depth_m)]])
 
     def sees(self, *_: object) -> bool:
         return True

@@ -72,35 +72,33 @@ def ramp() -> GroundSurface:
 def test_a_grid_lies_on_the_ground_and_its_cells_at_their_places(ramp):
     pytest.importorskip("trimesh", reason="the extra view is not installed")
     cells = np.full((20, 40), UNKNOWN, np.int8)
-    cells[:, :30], cells[4, 11] = FREE, OCCUPIED
+    cells[:, :34], cells[4, 11] = FREE, OCCUPIED
     shown = Shown()
-    server._add_grid(shown, "grid", OccupancyGrid(cells, 0.5, (0.0, 0.0)), ramp, 0.1)
-    mesh = shown.mesh
-    inner = (mesh.vertices[:, 0] > 1) & (mesh.vertices[:, 0] < 15)
+    server._add_grid(shown, "grid", OccupancyGrid(cells, 0.5, (0.0, 0.0)), ramp)
+    mesh, rgb = shown.mesh, shown.mesh.visual.vertex_colors[:, :3]
+    x, y, _ = mesh.vertices.T
+    inner = (x > 1) & (x < 15) & (y < 10)  # whose neighbours are known, too
     np.testing.assert_allclose(
-        mesh.vertices[inner, 2], 0.5 * mesh.vertices[inner, 0] + 0.1, atol=1e-9
+        mesh.vertices[inner, 2], 0.5 * mesh.vertices[inner, 0] + 0.25, atol=1e-6
     )
-    assert np.isfinite(mesh.vertices).all()
     assert (mesh.face_normals[:, 2] > 0).all()
-    assert mesh.bounds[:, :2].tolist() == [[0, 0], [20, 10]]
-    image = np.asarray(mesh.visual.material.emissiveTexture)
-
-    def texel(x_m: float, y_m: float) -> list[int]:
-        high, wide = image.shape[:2]
-        return image[int((1 - y_m / 10) * high), int(x_m / 20 * wide)].tolist()
-
-    assert texel(5.7, 2.2)[3] == 255
-    assert texel(5.7, 2.2) != texel(5.2, 2.2) == texel(5.7, 2.7) == texel(14.0, 9.0)
-    assert texel(15.2, 2.2)[3] == 0
+    # Of the cells that are known, those whose ground is.
+    assert mesh.bounds[:, :2].tolist() == [[0, 0], [16, 10]]
+    assert mesh.area_faces.sum() > 160.0
+    (occupied,) = {tuple(one) for one in rgb.tolist()} - {tuple(rgb[0].tolist())}
+    corners = mesh.vertices[(rgb == occupied).all(axis=1), :2]
+    assert (corners.min(axis=0).tolist(), corners.max(axis=0).tolist()) == ([5.5, 2], [6, 2.5])
 
 
-def test_a_wide_grid_is_an_image_that_browsers_show_in_which_no_obstacle_is_lost(ramp, monkeypatch):
+def test_cells_of_a_large_grid_are_merged_and_no_obstacle_is_lost(ramp, monkeypatch):
     pytest.importorskip("trimesh", reason="the extra view is not installed")
-    monkeypatch.setattr(server, "_MOST_TEXELS", 16)
-    cells = np.full((20, 40), FREE, np.int8)
+    monkeypatch.setattr(server, "_MOST_CELLS", 60)
+    cells = np.full((19, 32), FREE, np.int8)
     cells[7, 13] = OCCUPIED
     shown = Shown()
-    server._add_grid(shown, "grid", OccupancyGrid(cells, 0.5, (0.0, 0.0)), ramp, 0.0)
-    image = np.asarray(shown.mesh.visual.material.emissiveTexture)
-    assert image.shape == (7, 14, 4)
-    assert (image != image[0, 0]).any(axis=2).sum() == 1
+    server._add_grid(shown, "grid", OccupancyGrid(cells, 0.5, (0.0, 0.0)), ramp)
+    mesh, rgb = shown.mesh, shown.mesh.visual.vertex_colors[:, :3]
+    assert len(mesh.faces) == 2 * 5 * 8
+    assert (rgb != rgb[0]).any(axis=1).sum() == 4
+    occupied = mesh.vertices[(rgb != rgb[0]).any(axis=1), :2]
+    assert occupied.min(axis=0).tolist() == [6, 2]

@@ -76,8 +76,8 @@ def test_moving_and_turning_about_z_changes_no_figure(places, angle, by):
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
     )
     xyz = np.array(places)
-    for tool in TOOLS.values():
-        for of in tool.figures.values():
+    for _, figures_of in TOOLS.values():
+        for of in figures_of.values():
             moved = of(xyz @ turn.T + by, 3.0 + by[2])
             assert moved == pytest.approx(of(xyz, 3.0), abs=1e-6)
 
