@@ -8,9 +8,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
+from recon.core.errors import EvaluationError
 from recon.core.text import with_unit
 from recon.io.files import read_text, reading
 from recon.io.models.ply import read_ply
+from recon.map.sessions.measured import Survey
 from recon.map.store.records import check_format, connect
 from recon.report.scene import Scene
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
@@ -29,13 +31,21 @@ _FIGURES: Final = {
 
 
 def run_view(
-    runs: Sequence[Path], port: int, announce: Callable[[str], object], stopped: Callable[[], bool]
+    runs: Sequence[Path],
+    port: int,
+    announce: Callable[[str], object],
+    stopped: Callable[[], bool],
+    survey: Survey | None = None,
 ) -> str:
     """Show the maps of runs, each in its own axes, until ``stopped``: what `recon view` does.
 
     ``port`` is of this machine, for itself alone; ``announce`` gets the address, which is returned.
-    `ReconError`: a run has no map or a damaged one, viser is missing, or the port is taken.
+    Control points of a ``survey`` can be clicked in keyframes. `ReconError`: a run has no map or a
+    damaged one, viser is missing, the port is taken, or the survey has no control points.
     """
+    if survey is not None and survey.control is None:
+        what, hint = "positions along a drive cannot be clicked", "give a list of control points"
+        raise EvaluationError(what, where=survey.positions, hint=hint)
     shown = [(map_of(run), run) for run in runs]
     for run, _ in shown:
         if not (state_folder(run) / STARTED).is_file():
@@ -44,7 +54,7 @@ def run_view(
                 check_format(database, path)
     with closing(Viewer(port)) as viewer:
         announce(viewer.url)
-        coming = [(run, _scenes(folder, viewer, run)) for folder, run in shown]
+        coming = [(run, _scenes(folder, viewer, run, survey)) for folder, run in shown]
         while not stopped():
             for run, scenes in coming:
                 if (new := next(scenes, None)) is not None:
@@ -63,7 +73,9 @@ def map_of(run: Path) -> Path:
     return named if named.is_dir() else named.parent.parent  # its file
 
 
-def _scenes(run: Path, viewer: Viewer, asked: Path) -> Iterator[Scene | None]:
+def _scenes(
+    run: Path, viewer: Viewer, asked: Path, survey: Survey | None
+) -> Iterator[Scene | None]:
     path, busy = state_folder(run) / STARTED, state_folder(asked).is_dir
     if not (growing := path.is_file()) and not busy():
         yield read_products(run)
@@ -78,7 +90,7 @@ def _scenes(run: Path, viewer: Viewer, asked: Path) -> Iterator[Scene | None]:
     if growing:
         yield from grow(run, path)
     if not growing or (run / RECORD).is_file():  # else it was given up
-        scenes = finish(run, read_products(run))
+        scenes = finish(run, read_products(run), survey)
         yield from scenes if asked == run else follow_located(scenes, asked)
 
 

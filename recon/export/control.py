@@ -28,10 +28,10 @@ from recon.stereo.rectify.rectifier import turns_of
 
 _FEWEST: Final = 3
 _CLICK_PX: Final = 1.0  # standard deviation of a pixel that a person has chosen
-_SURVEYED_M: Final = 0.02  # of a coordinate, by a receiver with corrections
+SURVEYED_M: Final = 0.02  # of a coordinate, by a receiver with corrections
 
 
-class _Sighting(NamedTuple):
+class Sighting(NamedTuple):
     """What an image shows of a point."""
 
     T_camera_map: Float64
@@ -56,7 +56,7 @@ def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | Non
     images_of = _Images(open_images(map_, images), where, threads)
     lines, points, ours = [], [], []
     for point in tracked(control.points, "points", "match control points"):
-        found = _located([images_of.sighting(*seen) for seen in point.seen])
+        found = triangulate([images_of.sighting(*seen) for seen in point.seen])
         if found is None:
             lines.append(f"control point {point.name} has no depth where it is seen: left out")
         else:
@@ -68,7 +68,7 @@ def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | Non
         raise EvaluationError(what, where=where, got=int(used.sum()), expected=expected)
     ours_m, place_m = np.array([xyz for xyz, _ in ours]), np.array([p.place_m for p in points])
     check_inside(control.system, np.median(place_m, axis=0), where)
-    spread = np.array([covariance for _, covariance in ours]) + _SURVEYED_M**2 * np.eye(3)
+    spread = np.array([covariance for _, covariance in ours]) + SURVEYED_M**2 * np.eye(3)
     sigma_m = np.sqrt(np.linalg.eigvalsh(spread)[:, -1])
     allowed_m = 4 * float(np.median(sigma_m))
     agree = used.copy()
@@ -119,7 +119,7 @@ class _Images:
         self._turns = [turns_of(one.rig, settings_of(one.session).rectification) for one in drives]
         self._matched: dict[tuple[int, int], Disparity] = {}
 
-    def sighting(self, image: str, pixel: Float64) -> _Sighting:
+    def sighting(self, image: str, pixel: Float64) -> Sighting:
         number, frame = self._frame(image)
         drive = self._drives[number]
         at = pixel[None]
@@ -133,10 +133,7 @@ class _Images:
             pair = next(drive.source.frames(frame))
             self._matched[number, frame] = self._matchers[number].match(pair)[1].only_measured()
         seen = self._matched[number, frame]
-        row, column = round(float(v)), round(float(u))
-        uvd = np.array([u, v, seen.values[row, column]], np.float64)
-        sigma = np.array([_CLICK_PX, _CLICK_PX, seen.sigma_px[row, column]], np.float64)
-        return _Sighting(invert(drive.T_map_camera[frame]), camera, uvd, sigma)
+        return sighted(drive.T_map_camera[frame], camera, seen, float(u), float(v))
 
     def _frame(self, image: str) -> tuple[int, int]:
         """Return the number of a drive with an image of that name or number, and of its frame."""
@@ -151,7 +148,17 @@ class _Images:
         raise EvaluationError(what, where=self._where, got=image, expected=expected)
 
 
-def _located(sightings: Sequence[_Sighting]) -> tuple[Float64, Float64] | None:
+def sighted(
+    T_map_camera: Float64, camera: RectifiedCamera, seen: Disparity, u: float, v: float
+) -> Sighting:
+    """Return what an image shows of a point at a rectified pixel that a person has chosen."""
+    at = round(v), round(u)
+    sigma_px = np.array([_CLICK_PX, _CLICK_PX, seen.sigma_px[at]], np.float64)
+    uvd = np.array([u, v, seen.values[at]], np.float64)
+    return Sighting(invert(T_map_camera), camera, uvd, sigma_px)
+
+
+def triangulate(sightings: Sequence[Sighting]) -> tuple[Float64, Float64] | None:
     """Return a point (3,), map axes, by least squares, and its covariance; None without depth."""
     deep = [one for one in sightings if np.isfinite(one.uvd[2])]
     if not deep:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -53,6 +53,15 @@ class Keyframes(Protocol):
 
     @property
     def T_map_camera(self) -> Sequence[Float64]: ...
+
+    @property
+    def points(self) -> Mapping[str, Float64]:
+        """The control points that can be clicked in them, by name each (3,)."""
+        ...
+
+    def mark(self, name: str, number: int, ray: Float64, depth_m: float) -> list[str]:
+        """Return what a click (2, 3) at a control point, in an image at a depth, says of it."""
+        ...
 
     def outline(self, number: int, depth_m: float) -> Float64:
         """Return line segments (N, 2, 3) around what a keyframe has in view up to a depth."""

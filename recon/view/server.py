@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from html import escape
 from pathlib import Path
 from threading import Event
@@ -13,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import require
+from recon.core.geometry.se3 import quaternion_from_rotation
 from recon.core.text import counted
 from recon.core.values import UNKNOWN, OccupancyGrid, PointCloud
 from recon.core.values.arrays import Float64
@@ -38,6 +40,7 @@ _MOST_CAMERAS: Final = 36  # that are drawn
 _MOST_CELLS: Final = 150_000  # of a grid: about 13 MB
 _STEP: Final = 0.01  # of limits, metres or seconds
 _MOST_PLACES: Final = 100  # of a measurement
+_NO_POINT: Final = "none"
 _SEEN_BY: Final = "who saw it"
 _LAYERS: Final = {"cloud": True, "grid": False, "mesh": False, "path": True, "cameras": True}
 _FLAT: Final[Any] = {"precision": "float32", "point_shading": "flat"}
@@ -65,6 +68,8 @@ class Viewer:
         self._places: list[PointCloud] = []  # that were clicked to measure, of one point each
         self._keyframes: list[tuple[Any, int]] = []  # each by its views, and its number there
         self._cameras = Points("", PointCloud(np.zeros((0, 3), np.float32)))  # that are drawn
+        self._control: dict[str, Float64] = {}  # control points, by their names
+        self._through: tuple[Any, int, Any] | None = None  # the keyframe that is shown, its image
         self._known: list[str] = [*COLOURINGS[:1]]  # of colourings
         self._drawn: dict[str, tuple[Any, ...]] = {}  # what each node was made of
         self._eye_m: Float64 = np.zeros(3)
@@ -84,6 +89,9 @@ class Viewer:
         self._parts = [part for one in scenes for part in one.points]
         views = [one.keyframes for one in scenes if one.keyframes is not None]
         self._keyframes = [(of, n) for of in views for n in range(len(of.T_map_camera))]
+        self._control = {name: place for of in views for name, place in of.points.items()}
+        self._point.options = (_NO_POINT, *self._control)
+        self._point.visible = bool(self._control)
         self._known, last = known_colourings(self._parts), len(self._keyframes) - 1
         self._by.options = self._known
         self._text.content = "<br>".join(_html(one.lines) for one in scenes)
@@ -105,6 +113,8 @@ class Viewer:
             self._places = []
         if "ray" in wanted:
             self._click(*wanted["ray"])
+        if "point" in wanted and self._point.value in self._control:
+            self._choose(None, self._control[self._point.value])
         if "keyframe" in wanted and self._keyframes:
             self._choose(wanted["keyframe"], None)
         if wanted:
@@ -154,14 +164,17 @@ class Viewer:
         self._tool = gui.add_dropdown("A click shows", (_SEEN_BY, *TOOLS))
         self._measured = gui.add_html("")
         clear = gui.add_button("Clear what is measured")
+        self._point = gui.add_dropdown("Control point", (_NO_POINT,), visible=False)
+        self._residual = gui.add_html("")
         self._slider = gui.add_slider("Keyframe", 0, 1, 1, 0, disabled=True)
         self._said = gui.add_html(_html(["Move the slider, or click into the scene."]))
         self._image = gui.add_image(np.zeros((1, 1, 3), np.uint8), format="jpeg", visible=False)
         boxes = [box for box, _ in self._layers]
         drawn = (self._by, *boxes, self._size, *self._limits.values(), self._tool)
-        self._controls = {one._impl.uuid: one for one in (*drawn, clear, self._slider)}
+        self._controls = {one._impl.uuid: one for one in (*drawn, clear, self._point, self._slider)}
         for control in drawn:
             control.on_update(lambda _: self._note(drawn=True))
+        self._point.on_update(lambda _: self._note(point=True))
         clear.on_click(lambda _: self._note(clear=True))
         self._slider.on_update(lambda e: self._note(keyframe=e.client and e.target.value))
         scene.on_click()(lambda e: self._note(ray=np.array([e.ray_origin, e.ray_direction])))
@@ -196,6 +209,8 @@ class Viewer:
             self._draw_rest(number, scene, limits)
         if self._keyframes:
             self._draw_cameras()
+        if self._through is not None and self._point.value in self._control:
+            self._draw_image(*self._through)
         self._measured.content = ""
         if self._places and self._tool.value in TOOLS:
             self._draw_measured()
@@ -253,10 +268,23 @@ class Viewer:
         if self._changed("/cameras/all", *known):
             eyes_m = np.array([of.T_map_camera[n][:3, 3] for of, n in known])
             steps_m = np.linalg.norm(np.diff(eyes_m, axis=0), axis=1)
-            self._camera_m = 0.3 * float(np.median(steps_m)) if last else 0.3
+            least_m = max(one.spacing_m for one in self._scenes.values())
+            self._camera_m = max(least_m, 0.3 * float(np.median(steps_m)) if last else 0.0)
             self._cameras = Points("", PointCloud(eyes_m.astype(np.float32), session=numbers))
             lines = np.concatenate([of.outline(n, self._camera_m) for of, n in known])
             self._server.scene.add_line_segments("/cameras/all", lines, _YELLOW, **_LINE)
+
+    def _draw_image(self, of: Any, number: int, image: Any) -> None:
+        """Hold the image of a keyframe before its eye, and look at it from there."""
+        if self._changed("/control/image", of, number):
+            T, lines = of.T_map_camera[number], of.outline(number, self._camera_m / 2)
+            (left, right, _, low), middle_m = lines[:4, 1], lines[:4, 1].mean(axis=0)
+            size_m = [float(np.linalg.norm(end - left)) for end in (right, low)]
+            how = {"wxyz": np.roll(quaternion_from_rotation(T[:3, :3]), 1), "position": middle_m}
+            self._server.scene.add_image("/control/image", image, *size_m, **how)
+            for client in self._server.get_clients().values():
+                with suppress(ValueError):  # what a page says of its camera need not be one
+                    client.camera.position, client.camera.look_at = T[:3, 3], middle_m
 
     def _draw_measured(self) -> None:
         """Show what is measured between the places that were clicked for it."""
@@ -277,6 +305,12 @@ class Viewer:
 
     def _click(self, origin_m: Float64, direction: Float64) -> None:
         """Do what the chosen tool does with the point, or a camera, that a ray meets first."""
+        if self._through is not None and (name := self._point.value) in self._control:
+            of, number, _ = self._through
+            ray = np.stack([origin_m, direction])
+            if lines := of.mark(name, number, ray, self._camera_m / 2):
+                self._residual.content = _html(lines)
+                return
         found = pick([part for part, _ in self._shown.values()], origin_m, direction)
         shown = [self._cameras] if self._layers[-1][0].value else []
         camera = pick(shown, origin_m, direction, self._camera_m)
@@ -308,6 +342,7 @@ class Viewer:
             said, image = of.look(number)
             lines, self._image.visible = [*said, *lines], image is not None
             self._image.image = self._image.image if image is None else image
+            self._through = None if image is None else (of, number, image[: len(image) // 3])
         self._said.content = _html(lines)
 
 

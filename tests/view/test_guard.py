@@ -3,6 +3,7 @@
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from recon.core.errors import OutputError
 from recon.view import guard
 from recon.view.guard import Guard
 from recon.view.server import Viewer
-from tests.view.conftest import Served, small_scene, until
+from tests.view.conftest import Served, Views, small_scene, until
 
 msgspec = pytest.importorskip("msgspec", reason="the extra view is not installed")
 client = pytest.importorskip("websockets.sync.client")
@@ -226,6 +227,40 @@ def test_tools_of_the_page_measure_and_choose_points(served, protocol):
         assert until(lambda: shown() == whole)
 
 
+class Clicked(Views):
+    """Keyframes with an image, in which a control point can be clicked if the ray goes up."""
+
+    points, marked = {"p1": np.array([0.5, 0.5, 0.5])}, ()
+
+    def look(self, number: int) -> tuple[list[str], np.ndarray]:
+        return [f"keyframe {number}"], np.zeros((30, 20, 3), np.uint8)
+
+    def mark(self, name: str, number: int, ray: np.ndarray, depth_m: float) -> list[str]:
+        self.marked = (name, number, ray.tolist())
+        return ["p1, map minus survey:"] if ray[1, 2] > 0 else []
+
+
+def test_a_click_at_the_image_of_a_keyframe_is_one_at_the_chosen_control_point(served, protocol):
+    viewer = served.viewer
+    assert not viewer._point.visible
+    viewer.show(Path("run"), replace(small_scene(), keyframes=(views := Clicked())))
+    assert viewer._point.visible
+    with joined(served, protocol) as page:
+        nowhere = CAMERA | {"position": [0] * 3, "up_direction": [0] * 3}
+        for message in (CAMERA, nowhere, choice(served, "Control point", "p2"), CLICK):
+            page.send(msgspec.msgpack.encode(message))
+        assert until(lambda: "keyframe 0" in viewer._said.content)
+        assert (views.marked, node(viewer, "/control/image")) == ((), None)
+        page.send(msgspec.msgpack.encode(choice(served, "Control point", "p1")))
+        assert until(lambda: node(viewer, "/control/image"))
+        assert "The place at 0.5, 0.5, 0.5 m was seen by 2 keyframes: 0, 1" in viewer._said.content
+        page.send(msgspec.msgpack.encode(CLICK))
+        assert until(lambda: "p1, map minus survey:" in viewer._residual.content)
+        assert views.marked == ("p1", 0, [CLICK["ray_origin"], CLICK["ray_direction"]])
+        page.send(msgspec.msgpack.encode(choice(served, "Control point", "none")))
+        assert until(lambda: node(viewer, "/control/image") is None)
+
+
 def node(viewer: Viewer, name: str) -> object:
     return viewer._server.scene.get_handle_by_name(name)
 
@@ -260,7 +295,13 @@ def hostile(served: Served) -> list[dict]:
     ]
     values += [
         choice(served, label, value)
-        for label in ("A click shows", "Clear what is measured", "Point size", "Forward, x (m)")
+        for label in (
+            "A click shows",
+            "Clear what is measured",
+            "Point size",
+            "Forward, x (m)",
+            "Control point",
+        )
         for value in ("nothing", 9, -1, 1 << 62, 9.5, NAN, None, [], {}, ["area"], b"a", [1.0])
     ]
     values += [
