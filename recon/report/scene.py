@@ -54,10 +54,7 @@ class Keyframes(Protocol):
     @property
     def T_map_camera(self) -> Sequence[Float64]: ...
 
-    @property
-    def points(self) -> Mapping[str, Float64]:
-        """The control points that can be clicked in them, by name each (3,)."""
-        ...
+    points: Mapping[str, Float64]  # control points that can be clicked in them, by name each (3,)
 
     def mark(self, name: str, number: int, ray: Float64, depth_m: float) -> list[str]:
         """Return what a click (2, 3) at a control point, in an image at a depth, says of it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -52,8 +52,8 @@ def finish(run: Path, scene: Scene, survey: Survey | None = None) -> Iterator[Sc
     map_ = Map.open(run)  # as long as its keyframes are looked at
     named = ((one.number, one.info.source, one.date.text[:10]) for one in map_.linked)
     drives = [f"Drive {number}: {name} {date}".rstrip() for number, name, date in named]
-    scene = replace(scene, paths=_paths(map_), keyframes=KeyframeViews(map_, survey))
-    scene = replace(scene, lines=[*scene.lines, *drives])
+    views, lines = KeyframeViews(map_, survey), [*scene.lines, *drives]
+    scene = replace(scene, paths=_paths(map_), keyframes=views, lines=lines)
     yield scene
     if scene.points and (grid := run / GRID).is_file():
         scene = replace(scene, grids=((read_grid(grid), _ground(map_, scene)),))
@@ -66,7 +66,8 @@ def _ground(map_: Map, scene: Scene) -> GroundSurface:
     """Return the ground below the paths of a map, by its points."""
     settings, gap = settings_of(map_.first), np.full((1, 3), np.nan)
     pieces = [piece for path in scene.paths for piece in (path.cloud.xyz, gap)]
-    cloud = join_clouds(part.cloud for part in scene.points)
+    clouds = (part.cloud for part in scene.points)
+    cloud = join_clouds(PointCloud(c.xyz, normals=c.normals, frame="map") for c in clouds)
     reach_m = settings.occupancy.max_range_m
     return estimate_ground_surface(cloud, np.concatenate(pieces), settings.ground, reach_m)
 
@@ -175,7 +176,7 @@ class KeyframeViews:
 
     def __init__(self, map_: Map, survey: Survey | None = None) -> None:
         self._map, self._views = map_, MapViews(map_)
-        self.points: dict[str, Float64] = {}
+        self.points: Mapping[str, Float64] = {}
         self._marks: dict[str, dict[int, Sighting]] = {}  # by keyframe, of each control point
         if survey is not None and survey.control is not None:
             self._T_survey_map = locate(map_, survey, (), None).T_survey_map
@@ -193,10 +194,9 @@ class KeyframeViews:
         camera, eye = self._camera(number), np.zeros((4, 3))
         u, v = np.array([(0, 1, 1, 0), (0, 0, 1, 1)]) * [[camera.width_px], [camera.height_px]]
         corners = unproject(u - 0.5, v - 0.5, np.full(4, depth_m), camera)
-        ends = np.concatenate([eye, corners]), np.concatenate([corners, np.roll(corners, 1, 0)])
-        return apply(self.T_map_camera[number], np.stack(ends, axis=1).reshape(-1, 3)).reshape(
-            -1, 2, 3
-        )
+        ends = np.concatenate([eye, corners, corners, np.roll(corners, 1, axis=0)])
+        ends = apply(self.T_map_camera[number], ends).reshape(2, 2, 4, 3)
+        return np.asarray(np.concatenate(np.swapaxes(ends, 1, 2)))
 
     def sees(self, number: int, place_m: Float64) -> bool:
         """Return whether a keyframe has a place (3,), map axes, in view, with nothing before it."""
@@ -245,8 +245,7 @@ class KeyframeViews:
         """
         camera, T = self._camera(number), self.T_map_camera[number]
         eye, end = apply(invert(T), np.stack([ray[0], ray.sum(axis=0)]))
-        ahead = max((end - eye)[2], 1e-9)
-        met = eye + (end - eye) * (depth_m - eye[2]) / ahead
+        met = eye + (end - eye) * (depth_m - eye[2]) / max((end - eye)[2], 1e-9)
         u, v, _ = (float(each[0]) for each in project(met[None], camera))
         if not (0 <= u <= camera.width_px - 1 and 0 <= v <= camera.height_px - 1):
             return []

@@ -29,7 +29,7 @@ from recon.report.scene import (
     near_others,
 )
 from recon.view.guard import Guard, stop
-from recon.view.tools import LIMITS, TOOLS, Limits, ends_of, measure, within
+from recon.view.tools import LIMITS, TOOLS, Limits, ends_of, limited, measure, within
 
 MOST_POINTS: Final = 1_500_000  # in the browser: about 25 MB
 FIRST_POINTS: Final = 100_000  # until a browser has them, and asks for more
@@ -38,7 +38,7 @@ _CLICK_RAD: Final = 0.006  # about five pixels of a screen
 _HALF_VIEW: Final = (0.9, 0.7)  # tangents across and up of what viser's page has in view at first
 _MOST_CAMERAS: Final = 36  # that are drawn
 _MOST_CELLS: Final = 150_000  # of a grid: about 13 MB
-_STEP: Final = 0.01  # of limits, metres or seconds
+_STEP: Final = 0.01  # of limits
 _MOST_PLACES: Final = 100  # of a measurement
 _NO_POINT: Final = "none"
 _SEEN_BY: Final = "who saw it"
@@ -86,6 +86,7 @@ class Viewer:
             self._server.initial_camera.look_at = centre
         self._scenes[run] = scene
         scenes = self._scenes.values()
+        self._spacing_m = max(one.spacing_m for one in scenes)
         self._parts = [part for one in scenes for part in one.points]
         views = [one.keyframes for one in scenes if one.keyframes is not None]
         self._keyframes = [(of, n) for of in views for n in range(len(of.T_map_camera))]
@@ -136,13 +137,12 @@ class Viewer:
             return value in one.options
         if type(one.value) is bool:  # of a button, too
             return type(value) is bool
-        given, now = (value, one.value) if isinstance(one.value, tuple) else ([value], [one.value])
-        kinds = {type(now[0]), int}
-        return (
-            (type(given), len(given)) == (list, len(now))
-            and {type(number) for number in given} <= kinds
-            and bool(one.min <= given[0] <= given[-1] <= one.max)
-        )
+        given, kind = [value], type(one.value)
+        if kind is tuple:
+            given, kind = value, float
+        fits = type(given) is list and len(given) == np.size(one.value)
+        fits = fits and {*map(type, given)} <= {int, kind}
+        return bool(fits and one.min <= given[0] <= given[-1] <= one.max)
 
     def _lay_out(self) -> None:
         gui, scene = self._server.gui, self._server.scene
@@ -157,9 +157,8 @@ class Viewer:
         self._size = gui.add_slider("Point size", 0.25, 4.0, 0.25, 1.0)
         with gui.add_folder("Show only", expand_by_default=False):
             self._limits = {
-                by: gui.add_multi_slider(name, 0.0, 1.0, step, (0.0, 1.0), disabled=True)
+                by: gui.add_multi_slider(name, 0.0, 1.0, _STEP, (0.0, 1.0), disabled=True)
                 for by, name in LIMITS.items()
-                for step in [1.0 if by == "session" else _STEP]
             }
         self._tool = gui.add_dropdown("A click shows", (_SEEN_BY, *TOOLS))
         self._measured = gui.add_html("")
@@ -225,14 +224,8 @@ class Viewer:
             self._legend.content = _html([legend])
         named = {f"/cloud/{n}_{part.name}": one for n, one in scenes for part in one.points}
         if self._changed("limits", limits, *parts) or new:
-            keeps = [within(part, limits) for part in parts]
-            self._shown = {
-                name: (part, rgb)
-                if keep.all()
-                else (Points(part.name, part.cloud.select(keep)), rgb[keep])
-                for name, part, rgb, keep in zip(named, parts, self._colours, keeps, strict=True)
-                if keep.any()
-            }
+            kept = [limited(*one, limits) for one in zip(parts, self._colours, strict=True)]
+            self._shown = {n: one for n, one in zip(named, kept, strict=True) if len(one[1])}
         most = MOST_POINTS if self.looked_at else FIRST_POINTS
         halved = halvings([part for part, _ in self._shown.values()], self._eye_m, most)
         for (name, (part, rgb)), times in zip(self._shown.items(), halved, strict=True):
@@ -255,8 +248,7 @@ class Viewer:
             name = f"/path/{number}_{path.name}"
             if self._changed(name, path, by, limits):
                 (own,), _ = colours([path], by if by in ("age", "session") else "image")
-                keep = within(path, limits)
-                both = keep[:-1] & keep[1:]
+                both = np.all([(keep := within(path, limits))[:-1], keep[1:]], axis=0)
                 pairs = [np.stack([a[:-1], a[1:]], axis=1)[both] for a in (path.cloud.xyz, own)]
                 api.add_line_segments(name, *pairs, **_LINE)
 
@@ -268,8 +260,7 @@ class Viewer:
         if self._changed("/cameras/all", *known):
             eyes_m = np.array([of.T_map_camera[n][:3, 3] for of, n in known])
             steps_m = np.linalg.norm(np.diff(eyes_m, axis=0), axis=1)
-            least_m = max(one.spacing_m for one in self._scenes.values())
-            self._camera_m = max(least_m, 0.3 * float(np.median(steps_m)) if last else 0.0)
+            self._camera_m = max(self._spacing_m, 0.3 * float(np.median(steps_m)) if last else 0.0)
             self._cameras = Points("", PointCloud(eyes_m.astype(np.float32), session=numbers))
             lines = np.concatenate([of.outline(n, self._camera_m) for of, n in known])
             self._server.scene.add_line_segments("/cameras/all", lines, _YELLOW, **_LINE)
@@ -296,7 +287,7 @@ class Viewer:
         ground_m = next(filter(math.isfinite, below_m), math.nan)
         self._measured.content = _html(measure(tool, xyz, np.array(sigma_m), ground_m))
         if self._changed("/measured/lines", tool, *self._places):
-            size_m = 2.0 * max(one.spacing_m for one in self._scenes.values())
+            size_m = 2.0 * self._spacing_m
             shown = xyz + np.array([0.0, 0.0, size_m])  # else points around would hide them
             pairs = np.stack([shown, np.roll(shown, -1, axis=0)], axis=1)
             pairs = pairs[: {"distance": len(pairs) - 1, "height": 0}.get(tool)]
@@ -311,7 +302,8 @@ class Viewer:
             if lines := of.mark(name, number, ray, self._camera_m / 2):
                 self._residual.content = _html(lines)
                 return
-        found = pick([part for part, _ in self._shown.values()], origin_m, direction)
+        parts = [part for part, _ in self._shown.values()]  # drawn as squares of their spacing
+        found = pick(parts, origin_m, direction, self._spacing_m / 2)
         shown = [self._cameras] if self._layers[-1][0].value else []
         camera = pick(shown, origin_m, direction, self._camera_m)
         if self._tool.value in TOOLS:

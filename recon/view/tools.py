@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from recon.core.text import counted, metres
-from recon.core.values.arrays import Bool, Float64
+from recon.core.values.arrays import Bool, Float64, UInt8
 from recon.report.scene import Points, near_others
 
 Limits = Mapping[str, tuple[float, float]]
@@ -74,6 +74,12 @@ def within(part: Points, limits: Limits) -> Bool:
         if (values := part.values(by)) is not None:
             keep &= ~((values < low) | (values > high))
     return keep
+
+
+def limited(part: Points, rgb: UInt8, limits: Limits) -> tuple[Points, UInt8]:
+    """Return the points of a part that are within limits, itself if all are, and their colours."""
+    keep = within(part, limits)
+    return (part, rgb) if keep.all() else (Points("", part.cloud.select(keep)), rgb[keep])
 
 
 def ends_of(parts: Sequence[Points], by: str) -> tuple[int, int]:
