@@ -28,6 +28,12 @@ Beside = Annotated[int | None, typer.Option(hidden=True)]
 def view(
     runs: Runs,
     port: Port = PORT,
+    georeference: Annotated[
+        Path | None, opt.option("Control points, to be clicked in keyframes of the runs.")
+    ] = None,
+    crs: Annotated[
+        str | None, opt.option("Coordinate system of the control points, such as EPSG:25832.")
+    ] = None,
     beside: Beside = None,
     json: opt.Json = False,
     quiet: opt.Quiet = False,
@@ -40,6 +46,7 @@ def view(
     Examples:
       recon view outputs/map/latest
       recon view outputs/monday outputs/friday --port 8090
+      recon view outputs/site --georeference gcp_list.txt
     """
     with until_interrupted() as stopped, one_line_errors(quiet=quiet or beside is not None):
         if beside is not None:
@@ -56,7 +63,7 @@ def view(
         def over() -> bool:
             return stopped() or beside not in (None, os.getppid())
 
-        url = run_view(runs, port, announce, over)
+        url = run_view(runs, port, announce, over, opt.survey_of(georeference, None, crs))
     if json:
         print_json({"url": url})
 

@@ -35,7 +35,7 @@ _MOST_SIGMAS: Final = 3.0  # by which a coordinate may be off without a word
 _NOWHERE: Final = (np.full(3, np.nan), np.eye(3))
 
 
-class _Sighting(NamedTuple):
+class Sighting(NamedTuple):
     """What an image shows of a point."""
 
     T_camera_map: Float64
@@ -59,7 +59,7 @@ def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | Non
         return georeference(map_, survey)
     images_of, points = _Images(open_images(map_, images), where, threads), control.points
     ours = [
-        _located([images_of.sighting(*seen) for seen in point.seen]) or _NOWHERE
+        triangulate([images_of.sighting(*seen) for seen in point.seen]) or _NOWHERE
         for point in tracked(points, "points", "match control points")
     ]
     ours_m, place_m = np.array([xyz for xyz, _ in ours]), np.array([p.place_m for p in points])
@@ -134,7 +134,7 @@ class _Images:
         self._turns = [turns_of(one.rig, settings_of(one.session).rectification) for one in drives]
         self._matched: dict[tuple[int, int], Disparity] = {}
 
-    def sighting(self, image: str, pixel: Float64) -> _Sighting:
+    def sighting(self, image: str, pixel: Float64) -> Sighting:
         number, frame = self._frame(image)
         drive = self._drives[number]
         at = pixel[None]
@@ -148,10 +148,7 @@ class _Images:
             pair = next(drive.source.frames(frame))
             self._matched[number, frame] = self._matchers[number].match(pair)[1].only_measured()
         seen = self._matched[number, frame]
-        row, column = round(float(v)), round(float(u))
-        uvd = np.array([u, v, seen.values[row, column]], np.float64)
-        sigma = np.array([_CLICK_PX, _CLICK_PX, seen.sigma_px[row, column]], np.float64)
-        return _Sighting(invert(drive.T_map_camera[frame]), camera, uvd, sigma)
+        return sighted(drive.T_map_camera[frame], camera, seen, float(u), float(v))
 
     def _frame(self, image: str) -> tuple[int, int]:
         """Return the number of a drive with an image of that name or number, and of its frame."""
@@ -166,7 +163,17 @@ class _Images:
         raise EvaluationError(what, where=self._where, got=image, expected=expected)
 
 
-def _located(sightings: Sequence[_Sighting]) -> tuple[Float64, Float64] | None:
+def sighted(
+    T_map_camera: Float64, camera: RectifiedCamera, seen: Disparity, u: float, v: float
+) -> Sighting:
+    """Return what an image shows of a point at a rectified pixel that a person has chosen."""
+    at = round(v), round(u)
+    sigma_px = np.array([_CLICK_PX, _CLICK_PX, seen.sigma_px[at]], np.float64)
+    uvd = np.array([u, v, seen.values[at]], np.float64)
+    return Sighting(invert(T_map_camera), camera, uvd, sigma_px)
+
+
+def triangulate(sightings: Sequence[Sighting]) -> tuple[Float64, Float64] | None:
     """Return a point (3,), map axes, by least squares, and its covariance; None without depth."""
     deep = [one for one in sightings if np.isfinite(one.uvd[2])]
     if not deep:

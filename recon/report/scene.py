@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from recon.core.geometry.se3 import apply, transform_cloud
 from recon.core.values import ATTRIBUTES, OccupancyGrid, PointCloud, TriangleMesh
 from recon.core.values.arrays import Bool, Float64, UInt8
+from recon.map.ground.surface import GroundSurface
 
 # From camera axes (x right, y down, z forward) to x forward and z up.
 T_UPRIGHT_CAMERA: Final[Float64] = np.array(
@@ -41,10 +42,10 @@ class Points:
     cloud: PointCloud
 
     def values(self, by: str) -> NDArray[Any] | None:
-        """Return what a colouring shows: (N,), or colours (N, 3) by ``image``; None = unknown."""
+        """Return what a colouring shows, x or y: (N,), ``image``: (N, 3); None = unknown."""
         if by in _SHOWN:
             return self.cloud.arrays.get(_SHOWN[by].name)
-        return self.cloud.xyz[:, 2]
+        return self.cloud.xyz[:, {"x": 0, "y": 1}.get(by, 2)]
 
 
 class Keyframes(Protocol):
@@ -52,6 +53,16 @@ class Keyframes(Protocol):
 
     @property
     def T_map_camera(self) -> Sequence[Float64]: ...
+
+    points: Mapping[str, Float64]  # control points that can be clicked in them, by name each (3,)
+
+    def mark(self, name: str, number: int, ray: Float64, depth_m: float) -> list[str]:
+        """Return what a click (2, 3) at a control point, in an image at a depth, says of it."""
+        ...
+
+    def outline(self, number: int, depth_m: float) -> Float64:
+        """Return line segments (N, 2, 3) around what a keyframe has in view up to a depth."""
+        ...
 
     def sees(self, number: int, place_m: Float64) -> bool:
         """Return whether a keyframe has a place (3,) in view, with nothing before it."""
@@ -70,7 +81,7 @@ class Scene:
         points: Parts of a cloud.
         mesh: Its surface.
         paths: Where cameras were, in order; ``rgb``: if a pose is trusted, or which path it is.
-        grids: Occupancy seen from above, each with its height; reports have figures of them.
+        grids: Occupancy seen from above, each with its ground; reports have figures of them.
         keyframes: Of the viewer, which asks them.
         lines: What the viewer says of the run.
         spacing_m: Between points.
@@ -80,7 +91,7 @@ class Scene:
     points: tuple[Points, ...] = ()
     mesh: TriangleMesh | None = None
     paths: tuple[Points, ...] = ()
-    grids: tuple[tuple[OccupancyGrid, float], ...] = ()
+    grids: tuple[tuple[OccupancyGrid, GroundSurface], ...] = ()
     keyframes: Keyframes | None = None
     lines: Sequence[str] = ()
     spacing_m: float = 0.1

@@ -27,6 +27,7 @@ from recon.io.models.ply import read_ply
 from recon.io.models.rasters import read_grid
 from recon.report.scene import colours
 from recon.run.directory import STARTED, state_folder
+from recon.run.finished import figure_of
 from recon.view.follow import add_located, finish, follow_located, grow
 from tests.flow.conftest import SMALL_STREET
 from tests.hostile.refusals import assert_refused, run
@@ -44,13 +45,20 @@ def test_a_finished_run_shows_all_points_of_its_cloud_its_grid_path_and_drift(sm
     whole, scene = read_ply(small_demo / "map/cloud.ply"), scenes[-1]
     shown = np.concatenate([part.cloud.xyz for part in scene.points])
     assert sorted(map(tuple, shown.tolist())) == sorted(map(tuple, whole.xyz.tolist()))
-    (path,), ((grid, height_m),) = scene.paths, scene.grids
+    (path,), ((grid, ground),) = scene.paths, scene.grids
     assert len(path.cloud) == 12
-    assert -3 < height_m < -1
+    below_m = path.cloud.xyz[:, 2] - ground.height_at(path.cloud.xyz[:, :2])
+    np.testing.assert_allclose(below_m, figure_of(small_demo, "camera_height_m"), atol=0.2)
     made = read_grid(small_demo / "map/grid.yaml")
     np.testing.assert_array_equal(grid.cells, made.cells)
-    assert any(line.startswith("expected_drift_percent") for line in scene.lines)
-    assert f"points {len(whole):,}" in scene.lines
+    assert f"Points in the map: {len(whole):,}" in scene.lines
+    assert not [line for line in scene.lines[1:] if "_" in line.partition(":")[0]]  # no keys
+    drift, path_m = (
+        next(line for line in scene.lines if name in line) for name in ("drift", "Path")
+    )
+    assert re.fullmatch(r"Expected drift: [\d.]+ %", drift)
+    assert re.fullmatch(r"Path: [\d.,]+ m", path_m)
+    assert re.fullmatch(r"Drive 0: synthetic street 0( \d{4}-\d\d-\d\d)?", scene.lines[-1])
 
 
 def test_points_know_the_drive_and_time_that_passed_nearest(scenes):

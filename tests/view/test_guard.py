@@ -3,6 +3,7 @@
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from recon.core.errors import OutputError
 from recon.view import guard
 from recon.view.guard import Guard
 from recon.view.server import Viewer
-from tests.view.conftest import Served, small_scene, until
+from tests.view.conftest import Served, Views, small_scene, until
 
 msgspec = pytest.importorskip("msgspec", reason="the extra view is not installed")
 client = pytest.importorskip("websockets.sync.client")
@@ -193,6 +194,77 @@ def test_what_the_page_sends_is_done(served, protocol):
         assert until(lambda: "keyframe 0" in viewer._said.content)
 
 
+def test_tools_of_the_page_measure_and_choose_points(served, protocol):
+    viewer = served.viewer
+    whole = len(viewer._parts[0].cloud)
+
+    def shown() -> int:
+        return sum(len(part.cloud) for part, _ in viewer._shown.values())
+
+    with joined(served, protocol) as page:
+        page.send(msgspec.msgpack.encode(CAMERA))
+        assert until(lambda: viewer.looked_at)
+        for label, value in (("Point size", 2.5), ("A click shows", "distance")):
+            page.send(msgspec.msgpack.encode(choice(served, label, value)))
+        assert until(lambda: viewer._size.value == 2.5)
+        assert until(lambda: node(viewer, "/cloud/0_0").point_size == pytest.approx(0.25))
+        for count, (x, y, _) in enumerate(viewer._parts[0].cloud.xyz[:2].tolist(), 1):
+            page.send(msgspec.msgpack.encode(CLICK | {"ray_origin": [x, y, -3.0]}))
+            assert until(lambda count=count: len(viewer._places) == count)
+            assert np.hypot(*(viewer._places[-1].xyz[0, :2] - [x, y])) < 0.06
+        assert until(lambda: "distance: 0." in viewer._measured.content)
+        assert node(viewer, "/measured/lines") is not None
+        page.send(msgspec.msgpack.encode(choice(served, "Clear what is measured", value=True)))
+        assert until(lambda: not viewer._measured.content)
+        assert until(lambda: node(viewer, "/measured/lines") is None)
+        page.send(msgspec.msgpack.encode(choice(served, "Forward, x (m)", [0, 0.25])))
+        assert until(lambda: 0.2 * whole < shown() < 0.3 * whole)
+        page.send(msgspec.msgpack.encode(choice(served, "Left, y (m)", [0.0, 0.0])))
+        assert until(lambda: shown() == 0)
+        assert node(viewer, "/cloud/0_0") is None
+        page.send(msgspec.msgpack.encode(choice(served, "Left, y (m)", [0, 1])))
+        page.send(msgspec.msgpack.encode(choice(served, "Forward, x (m)", [0, 1])))
+        assert until(lambda: shown() == whole)
+
+
+class Clicked(Views):
+    """Keyframes with an image, in which a control point can be clicked if the ray goes up."""
+
+    points, marked = {"p1": np.array([0.5, 0.5, 0.5])}, ()
+
+    def look(self, number: int) -> tuple[list[str], np.ndarray]:
+        return [f"keyframe {number}"], np.zeros((30, 20, 3), np.uint8)
+
+    def mark(self, name: str, number: int, ray: np.ndarray, depth_m: float) -> list[str]:
+        self.marked = (name, number, ray.tolist())
+        return ["p1, map minus survey:"] if ray[1, 2] > 0 else []
+
+
+def test_a_click_at_the_image_of_a_keyframe_is_one_at_the_chosen_control_point(served, protocol):
+    viewer = served.viewer
+    assert not viewer._point.visible
+    viewer.show(Path("run"), replace(small_scene(), keyframes=(views := Clicked())))
+    assert viewer._point.visible
+    with joined(served, protocol) as page:
+        nowhere = CAMERA | {"position": [0] * 3, "up_direction": [0] * 3}
+        for message in (CAMERA, nowhere, choice(served, "Control point", "p2"), CLICK):
+            page.send(msgspec.msgpack.encode(message))
+        assert until(lambda: "keyframe 0" in viewer._said.content)
+        assert (views.marked, node(viewer, "/control/image")) == ((), None)
+        page.send(msgspec.msgpack.encode(choice(served, "Control point", "p1")))
+        assert until(lambda: node(viewer, "/control/image"))
+        assert "The place at 0.5, 0.5, 0.5 m was seen by 2 keyframes: 0, 1" in viewer._said.content
+        page.send(msgspec.msgpack.encode(CLICK))
+        assert until(lambda: "p1, map minus survey:" in viewer._residual.content)
+        assert views.marked == ("p1", 0, [CLICK["ray_origin"], CLICK["ray_direction"]])
+        page.send(msgspec.msgpack.encode(choice(served, "Control point", "none")))
+        assert until(lambda: node(viewer, "/control/image") is None)
+
+
+def node(viewer: Viewer, name: str) -> object:
+    return viewer._server.scene.get_handle_by_name(name)
+
+
 NAN, FAR = float("nan"), 1e300
 
 
@@ -221,6 +293,24 @@ def hostile(served: Served) -> list[dict]:
         for label in ("Colours", "Show cloud", "Keyframe")
         for value in ("nothing", "age", 2, -1, 1 << 62, 0.5, NAN, None, [], {}, ["image"], b"a")
     ]
+    values += [
+        choice(served, label, value)
+        for label in (
+            "A click shows",
+            "Clear what is measured",
+            "Point size",
+            "Forward, x (m)",
+            "Control point",
+        )
+        for value in ("nothing", 9, -1, 1 << 62, 9.5, NAN, None, [], {}, ["area"], b"a", [1.0])
+    ]
+    values += [
+        choice(served, "Forward, x (m)", value)
+        for value in ([NAN, 0.5], [0.1, NAN], [0.5, 0.1], [-1.0, 0.5], [0.5, FAR], [0.1] * 3,
+                      [True, 1.0], ["0", "1"], [None, 1.0], {"0": 1}, "01", [[0.1], [0.5]])
+    ]  # fmt: skip
+    # Of what nothing is known yet, nothing can be chosen.
+    values += [choice(served, "Drives", [0.0, 0.5]), choice(served, "Drives", [0.0, 1.0])]
     uuid = choice(served, "Colours", "")["uuid"]
     updates = [{"options": []}, {"value": "height", "visible": False}, {}, {"_impl": 1}, [], None]
     return [
@@ -263,8 +353,10 @@ def test_no_message_changes_what_it_may_not_or_ends_the_viewer(served, protocol,
         assert served.ended is None
         assert viewer._by.value == "height"
         assert viewer._slider.value == 0
-        # As at first: the grid would hide the ground where that is not flat.
-        assert [box.value for box, _ in viewer._layers] == [True, False, False, True]
+        assert (viewer._tool.value, viewer._size.value) == ("who saw it", 1.0)
+        assert {one.value for one in viewer._limits.values()} == {(0.0, 1.0)}
+        # As at first.
+        assert [box.value for box, _ in viewer._layers] == [True, False, False, True, True]
         assert viewer._eye_m.tolist() == [1.0, 2.5, 3.0]
         assert "keyframe" not in viewer._said.content
     assert capfd.readouterr() == ("", "")

@@ -29,7 +29,7 @@ def test_every_control_of_the_page_and_a_click_into_the_scene_are_taken(served, 
         assert comes(page, lambda: page.run(f"!!{height}"))
         page.run(f"{height}.click()")
         assert comes(page, lambda: "blue to red" in viewer._legend.content)
-        page.run("document.querySelector('[role=slider]').focus()")
+        page.run("[...document.querySelectorAll('[role=slider]')].pop().focus()")
         page.press("ArrowRight")
         assert comes(page, lambda: "keyframe 1" in viewer._said.content)
         # Into the cloud, beside the panel.
@@ -38,4 +38,18 @@ def test_every_control_of_the_page_and_a_click_into_the_scene_are_taken(served, 
             page,
             lambda: page.click(0.4 * wide, 0.6 * high) or "keyframe 0" in viewer._said.content,
         )
+        page.run(f"document.getElementById('{viewer._tool._impl.uuid}').click()")
+        area = height.replace("'height'", "'area'")
+        assert comes(page, lambda: page.run(f"!!{area}"))
+        page.run(f"{area}.click()")
+        assert comes(page, lambda: viewer._tool.value == "area")
+        for across, down in ((0.4, 0.6), (0.45, 0.6), (0.45, 0.65)):
+            before = len(viewer._places)
+            page.click(across * wide, down * high)
+            assert comes(page, lambda before=before: len(viewer._places) > before)
+        shown = "document.body.innerText.includes('seen from above: 0.')"
+        assert comes(page, lambda: page.run(shown))
+        clear = "[...document.querySelectorAll('button')].find(o => o.innerText.includes('Clear'))"
+        page.run(f"{clear}.click()")
+        assert comes(page, lambda: not page.run(shown))
         assert page.errors == []
