@@ -70,6 +70,12 @@ def export(
         list[Path] | None,
         opt.option("The drive whose images are needed.", default="where it was mapped"),
     ] = None,
+    gsd: Annotated[
+        float | None,
+        opt.option(
+            "Cell size of the orthophoto in metres.", metavar="METRES", default="that of the images"
+        ),
+    ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
     *,
@@ -88,7 +94,7 @@ def export(
       recon export outputs/map/latest --to esdf --resolution 0.1
       recon export outputs/map/latest --to mesh --set mesh.depth=9
       recon export outputs/site --to laz --georeference gnss.txt --crs EPSG:25832
-      recon export outputs/site --to dsm,orthophoto --resolution 0.1
+      recon export outputs/site --to dsm,orthophoto --resolution 0.1 --gsd 0.03
       recon export outputs/city --to grid,octomap --workers 4
     """
     with shared.one_line_errors():
@@ -105,6 +111,7 @@ def export(
             workers=open_workers(workers, scheduler, shared),
             survey=opt.survey_of(georeference, antenna, crs),
             images=images or (),
+            gsd_m=gsd,
         )
     shared.show(summary)
 

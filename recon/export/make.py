@@ -38,6 +38,7 @@ from recon.export.occupancy import (
     grid_product,
     octomap_product,
 )
+from recon.export.orthophoto import orthophoto_product
 from recon.export.product import ExportContext, ExportResult, Product, ProductFigures
 from recon.export.rasters import RASTERS, raster_product, stem_of
 from recon.io.atomic import check_targets, writing_to
@@ -63,6 +64,13 @@ PRODUCTS: Final[Mapping[str, Product]] = {
         )
         for name in RASTERS
     },
+    "orthophoto": Product(
+        "map/orthophoto.tif",
+        orthophoto_product,
+        needs_occupancy=True,
+        surveyed=True,
+        needs_images=True,
+    ),
     "las": Product("map/cloud.las", las_product, surveyed=True),
     "laz": Product("map/cloud.laz", las_product, surveyed=True),
     "copc": Product("map/cloud.copc.laz", copc_product, surveyed=True),
