@@ -1,11 +1,9 @@
 """How near to their true places an orthophoto has things, by patches that are matched.
 
-``street RUN`` compares that of a run of `recon demo` with its street rendered from 5 km above.
-``halves DRIVE`` maps a drive twice, its even and its odd frames, with given poses if there are, and
-compares the two: what the relief, the choice of images and the matching contribute. Differences
-are the shift of each patch of 64 cells for which the match is best, by phase correlation.
+That of a run of `recon demo` is compared with its street rendered from 5 km above: the shift of
+each patch of 64 cells for which the match is best, by phase correlation.
 
-Example: python benchmarks/orthophoto.py street outputs/demo/latest
+Example: python benchmarks/orthophoto.py outputs/demo/latest
 """
 
 from __future__ import annotations

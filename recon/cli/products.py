@@ -45,9 +45,9 @@ def export(
         list[str] | None,
         opt.option(
             "cloud, grid, octomap, mesh; costmap (Nav2), esdf (distances, NumPy); for surveying "
-            "programs las, laz, copc, e57, and dsm, dtm, slope, orthophoto, grid-geotiff "
-            "(GeoTIFF); pcd (PCL), npz (NumPy), mcap, gridmap (ROS 2), colmap, nerfstudio, "
-            "texture; several with commas.",
+            "programs las, laz, copc, e57, contours (GeoPackage), and dsm, dtm, slope, orthophoto, "
+            "grid-geotiff (GeoTIFF); pcd (PCL), npz (NumPy), mcap, gridmap (ROS 2), colmap, "
+            "nerfstudio, texture; several with commas.",
             default="the first four",
         ),
     ] = None,

@@ -26,6 +26,7 @@ from recon.export.cloud import (
     pcd_product,
 )
 from recon.export.colmap import colmap_product
+from recon.export.contours import contours_product
 from recon.export.costmap import costmap_product, gridmap_product
 from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
@@ -71,6 +72,7 @@ PRODUCTS: Final[Mapping[str, Product]] = {
         surveyed=True,
         needs_images=True,
     ),
+    "contours": Product("map/contours.gpkg", contours_product, needs_occupancy=True, surveyed=True),
     "las": Product("map/cloud.las", las_product, surveyed=True),
     "laz": Product("map/cloud.laz", las_product, surveyed=True),
     "copc": Product("map/cloud.copc.laz", copc_product, surveyed=True),

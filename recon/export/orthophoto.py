@@ -35,7 +35,6 @@ from recon.export.rasters import RasterFigures, columns_of, ground_blocks, groun
 from recon.io.models.rasters import COLOUR_BANDS, RasterPlace, write_geotiff
 from recon.map.fusion import fusion_range_m
 from recon.map.ground.surface import WINDOW_M, GroundSurface
-from recon.map.sessions.placed import settings_of
 
 _BORDER: Final = 0.1  # fraction of the width of an image over which it counts less
 # Pixels of an image as a fraction of those of the best one: that do for what stands in one piece,
@@ -44,24 +43,21 @@ _ENOUGH, _WORST = 1 / 4, 1 / 16
 _SHARPNESS: Final = 8  # power of what images count, so that they blend where they are as good
 _DARK: Final = 8  # below, exposures cannot be compared
 _AROUND: Final = (5, 5)  # cells over which noise is averaged
-_SAME_CELLS: Final = 3  # that near, what is before a cell is of its own surface
 _STRIDE: Final = 4  # of the cells whose pixels are looked at for the size of all
 _ROWS: Final = 256  # of a raster at a time
+_LONGEST: Final = 1 << 14  # row that OpenCV takes
 
 
 def orthophoto_product(context: ExportContext, path: Path) -> ExportResult:
     """Write the map from above in the colours of its images, transparent where none sees it."""
-    drives, cell_m = context.drives, context.placed.tiles.config.fusion.voxel_m
-    range_m = max(fusion_range_m(d.session.camera, settings_of(d.session).fusion) for d in drives)
     with TemporaryDirectory(prefix=".colours-", dir=path.parent) as folder:
-        relief = Relief(place_of(context, cell_m), range_m, context.T_survey_map, Path(folder))
-        _raise(relief, context)
-        for drive in drives:
+        relief = Relief(context, Path(folder))
+        for drive in context.drives:
             for frame in tracked(np.flatnonzero(drive.placed).tolist(), "visibility", "frames"):
                 relief.look(relief.sight(drive.session.camera, drive.T_map_camera[frame]))
-        place = relief.place.in_cells(context.gsd_m or relief.gsd_m)
+        place = place_of(context, context.gsd_m or relief.gsd_m)
         painted = Canvas(relief, place)
-        for view in posed_images(drives):
+        for view in posed_images(context.drives):
             painted.add(view)
         with write_geotiff(path, place, bands=COLOUR_BANDS, crs=context.crs) as file:
             for row in range(0, place.rows, _ROWS):
@@ -89,19 +85,57 @@ class Relief:
         rgb: float32 (R, C, 3), colours of the fused points; NaN = none.
         piece: int32, what stands on the ground in one piece; 0 = the ground.
         pixels: float32, of the best image, per m²; 0 = none sees the cell.
-        shown: float64 (P,), how many pixels the image has of each piece that has most, per cell.
+        shown: float64 (P,), how many pixels the image has of each piece that has most.
     """
 
-    def __init__(
-        self, place: RasterPlace, range_m: float, T_file_map: Float64, folder: Path
-    ) -> None:
-        self.place, self.range_m, self.T_file_map, self.folder = place, range_m, T_file_map, folder
-        shape, self._radius = (place.rows, place.columns), math.ceil(range_m / place.cell_m)
+    def __init__(self, context: ExportContext, folder: Path) -> None:
+        config, self.folder, self.T_file_map = (
+            context.placed.tiles.config,
+            folder,
+            context.T_survey_map,
+        )
+        self.place = place_of(context, config.fusion.voxel_m)
+        cameras = [drive.session.camera for drive in context.drives]
+        far_m = max(fusion_range_m(camera, config.fusion) for camera in cameras)
+        self._radius = math.ceil(min(far_m, config.occupancy.max_range_m) / self.place.cell_m)
+        shape = self.place.rows, self.place.columns
         self.height_m: Float32 = self.array("height", shape, np.float32, np.nan)
         self.rgb: Float32 = self.array("rgb", (*shape, 3), np.float32, np.nan)
         self.piece: Int32 = self.array("piece", shape, np.int32)
         self.pixels: Float32 = self.array("pixels", shape, np.float32)
-        self.shown = np.zeros(1)
+        tiles, known, pieces = context.placed.tiles, dict(Flattening(context.placed).grounds()), 0
+        for tile in tiles:
+            pieces += self._add(tile.cloud, known.get(tiles.bounds(tile.key)), pieces)
+        self.shown = np.zeros(pieces + 1)
+        for row, column, (ground_m, shown) in ground_blocks(context, self.place, ground_heights):
+            heights = self.height_m[row : row + len(shown), column : column + shown.shape[1]]
+            bare = np.isnan(heights) & (shown > 0)
+            heights[bare] = ground_m[bare]
+
+    def _add(self, cloud: PointCloud, ground: GroundSurface | None, first: int) -> int:
+        """Put the points of a tile where they are highest; return how many pieces stand there."""
+        above_m = np.zeros(len(cloud))
+        if ground is not None:
+            above_m = cloud.xyz[:, 2] - ground.height_at(cloud.xyz[:, :2])
+            low = ~(above_m > ground.camera_height_m)  # NaN is low
+            cloud, above_m = cloud.select(low), above_m[low]
+        if not len(cloud):
+            return 0
+        if cloud.rgb is None:
+            raise MappingError("the points of the map have no colours")
+        xyz = apply(self.T_file_map, cloud.xyz.astype(np.float64))
+        at, total = columns_of(self.place, xyz, 1.0 if cloud.weight is None else cloud.weight)
+        weight = np.maximum(total(1.0), 1e-12)
+        stands = (total(above_m > WINDOW_M) > 0.5 * weight).astype(np.uint8)
+        count, pieces = cv2.connectedComponents(stands, connectivity=8)
+        height = _even(np.where(weight > 1e-12, total(xyz[:, 2]) / weight, np.nan))
+        higher = ~np.isnan(height) & ~(self.height_m[at] >= height)
+        rgb = np.dstack([total(band) / weight for band in cloud.rgb.T])
+        rgb[weight <= 1e-12] = np.nan
+        pieces[pieces > 0] += first
+        for old, new in ((self.height_m, height), (self.rgb, rgb), (self.piece, pieces)):
+            old[at][higher] = new[higher]
+        return count - 1
 
     def array(self, name: str, shape: tuple[int, ...], kind: Any, fill: float = 0.0) -> Any:
         """Return a new array in a file, if there is room for it: it is written without errors."""
@@ -149,7 +183,8 @@ class Relief:
         # Per area of a level surface, which is seen under the sine of the depression.
         pixels = -fade * off[..., 2] * camera.focal_px**2 / away_m**3
         # What is NaN is not seen, either.
-        seen = (pixels > 0) & (away_m <= self.range_m) & ~self._hidden(eye, cell, off)
+        off[..., 2] += np.where(self.piece[at] > 0, self.place.cell_m, 0)  # a roof hides no roof
+        seen = (pixels > 0) & ~self._hidden(eye, cell, off)
         return Sight(at, np.where(seen, pixels, 0).astype(np.float32), u, v)
 
     def _hidden(self, eye: Float64, cell: NDArray[Any], off: Float64) -> Bool:
@@ -168,49 +203,10 @@ class Relief:
         rise = np.fmax.accumulate((screen - eye[2]) / (steps * self.place.cell_m), axis=1)
         far_m = np.hypot(off[..., 0], off[..., 1])
         turn = np.rint(np.arctan2(off[..., 1], off[..., 0]) * (turns / (2 * np.pi))).astype(int)
-        step = np.floor(far_m / self.place.cell_m).astype(int) - _SAME_CELLS
+        step = np.floor(far_m / self.place.cell_m).astype(int) - 2  # up to the cell before
         before = rise[turn % turns, np.clip(step, 0, self._radius - 1)]
-        return np.asarray((step >= 0) & (off[..., 2] < before * far_m))
-
-
-def _raise(relief: Relief, context: ExportContext) -> None:
-    """Fill in the points of a map, and the ground where points show it around."""
-    tiles, known = context.placed.tiles, dict(Flattening(context.placed).grounds())
-    pieces = 0
-    for tile in tiles:
-        if len(tile.cloud):
-            pieces += _add(relief, tile.cloud, known.get(tiles.bounds(tile.key)), pieces)
-    relief.shown = np.zeros(pieces + 1)
-    for row, column, (ground_m, shown) in ground_blocks(context, relief.place, ground_heights):
-        heights = relief.height_m[row : row + len(shown), column : column + shown.shape[1]]
-        bare = np.isnan(heights) & (shown > 0)
-        heights[bare] = ground_m[bare]
-
-
-def _add(relief: Relief, cloud: PointCloud, ground: GroundSurface | None, first: int) -> int:
-    """Put the points of a tile where they are highest; return how many pieces stand there."""
-    if cloud.rgb is None:
-        raise MappingError("the points of the map have no colours")
-    above_m = np.zeros(len(cloud))
-    if ground is not None:
-        above_m = cloud.xyz[:, 2] - ground.height_at(cloud.xyz[:, :2])
-        low = ~(above_m > ground.camera_height_m)  # NaN is low
-        cloud, above_m = cloud.select(low), above_m[low]
-    if not len(cloud):
-        return 0
-    xyz = apply(relief.T_file_map, cloud.xyz.astype(np.float64))
-    found = columns_of(relief.place, xyz, cloud.weight)
-    stands = (found.mean(above_m > WINDOW_M) > 0.5).astype(np.uint8)
-    count, pieces = cv2.connectedComponents(stands, connectivity=8)
-    height, at = _even(found.mean(xyz[:, 2])), found.at
-    higher = ~np.isnan(height) & ~(relief.height_m[at] >= height)
-    for old, new in (
-        (relief.height_m, height),
-        (relief.rgb, np.dstack([found.mean(band) for band in np.asarray(cloud.rgb).T])),
-        (relief.piece, np.where(pieces > 0, pieces + first, 0)),
-    ):
-        old[at][higher] = new[higher]
-    return count - 1
+        hidden = (step >= 0) & (off[..., 2] < before * far_m)
+        return np.asarray(hidden | (step > self._radius - 3))  # or too far
 
 
 def _even(height_m: Float64) -> Float64:
@@ -220,7 +216,9 @@ def _even(height_m: Float64) -> Float64:
     off_m = np.where(known, height_m - middle_m, 0).astype(np.float32)
     weight = cv2.blur(known.astype(np.float32), _AROUND)
     around = cv2.blur(off_m, _AROUND) / np.maximum(weight, 1e-6)
-    even = cv2.medianBlur(np.where(known, off_m, around).astype(np.float32), _AROUND[0])
+    filled = np.where(known, off_m, around).astype(np.float32)
+    even = cv2.medianBlur(filled, _AROUND[0])
+    even = np.where(np.abs(even - filled) < WINDOW_M, even, filled)  # a corner of what stands
     return np.where(known | (weight > 0.5), even + middle_m, np.nan)
 
 
@@ -272,24 +270,19 @@ class Canvas:
 
 def _compared(image: UInt8, sight: Sight, fused: Float32, good: Bool) -> tuple[Float64, Float32]:
     """Return what makes an image as bright as the fused points (3,), and how it agrees (R, C)."""
-    rgb = np.zeros_like(fused)
-    rgb[good] = _sampled(image, sight.u[good], sight.v[good])
-    known = good & ~np.isnan(fused[..., 0])
-    light = rgb[known].min(axis=1, initial=255) > _DARK
-    gain = np.ones(3)
-    if light.any():
-        gain = np.median(fused[known][light] / rgb[known][light], axis=0)
-    off = np.zeros(good.shape, np.float32)
-    off[known] = np.abs(gain * rgb[known] - fused[known]).mean(axis=1)
-    usual = max(3 * float(np.median(off[known])), 3.0) if known.any() else 1.0
+    known, off = good & ~np.isnan(fused[..., 0]), np.zeros(good.shape, np.float32)
+    rgb, points = _sampled(image, sight.u[known], sight.v[known]), fused[known]
+    light = rgb.min(axis=1, initial=255) > _DARK
+    gain = np.median(points[light] / rgb[light], axis=0) if light.any() else np.ones(3)
+    off[known] = np.abs(gain * rgb - points).mean(axis=1)
+    usual = 3 * max(float(np.median(off[known])), 1.0) if known.any() else 1.0
     around = cv2.blur(off, _AROUND) / np.maximum(cv2.blur(known.astype(np.float32), _AROUND), 1e-6)
     return gain, np.exp(-0.5 * (around / usual) ** 2)
 
 
 def _sampled(image: UInt8, u: Float64, v: Float64) -> Float32:
     """Return float32 (N, 3), the colours of an image at columns and rows."""
-    width = 1 << 14  # OpenCV takes no longer rows
-    where = np.zeros((2, -(-len(u) // width), width), np.float32)
+    where = np.zeros((2, -(-len(u) // _LONGEST), _LONGEST), np.float32)
     where.reshape(2, -1)[:, : len(u)] = u, v
     found = cv2.remap(image, where[0], where[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(found.reshape(-1, 3)[: len(u)], np.float32)

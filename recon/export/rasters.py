@@ -19,7 +19,7 @@ from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, invert
 from recon.core.summary import inline, optional
 from recon.core.values import UNKNOWN
-from recon.core.values.arrays import Float64, Int64
+from recon.core.values.arrays import Float64
 from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.io.models.rasters import RasterFile, RasterPlace, write_geotiff
@@ -75,38 +75,28 @@ def place_of(context: ExportContext, cell_m: float) -> RasterPlace:
     return RasterPlace(cell_m, int(west), int(north), int(east - west), int(north - south))
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """The uppermost points of cells: those no lower than the highest by more than a cell is wide.
+def columns_of(
+    place: RasterPlace, xyz: Float64, weight: NDArray[Any] | float
+) -> tuple[tuple[slice, slice], Callable[[NDArray[Any] | float], Float64]]:
+    """Return the cells around points (N, 3), and what sums up values (N,) of the uppermost there.
 
-    On slopes up to 45° they are of one surface.
+    These are no lower than the highest by more than a cell is wide: of one surface, if it is no
+    steeper than 45°. Values are multiplied by the weights; sums are (rows, columns).
     """
-
-    at: tuple[slice, slice]  # rows and columns of the raster
-    cell: Int64  # (N,), number of each point's cell among these
-    weight: Float64  # (N,), of each point; 0 = it lies lower
-    shape: tuple[int, int]
-
-    def mean(self, values: NDArray[Any]) -> Float64:
-        """Return the weighted mean (rows, columns) of values (N,); NaN = there is no point."""
-        size = self.shape[0] * self.shape[1]
-        total, weight = (
-            np.bincount(self.cell, each, size) for each in (self.weight * values, self.weight)
-        )
-        means = np.where(weight > 0, total / np.where(weight > 0, weight, 1), np.nan)
-        return np.asarray(means.reshape(self.shape))
-
-
-def columns_of(place: RasterPlace, xyz: Float64, weight: NDArray[Any] | None) -> Columns:
-    """Return the uppermost of points (N, 3), N > 0, that have weights (N,); None = all the same."""
     row, column = place.cells_of(xyz[:, :2])
     at = np.s_[row.min() : row.max() + 1, column.min() : column.max() + 1]
     shape = int(np.ptp(row)) + 1, int(np.ptp(column)) + 1
-    cell = (row - row.min()) * shape[1] + column - column.min()
-    top = np.full(shape[0] * shape[1], -np.inf)
-    np.maximum.at(top, cell, xyz[:, 2])
-    upper = xyz[:, 2] >= top[cell] - place.cell_m
-    return Columns(at, cell, upper * (1.0 if weight is None else weight.astype(float)), shape)
+    cell, top = (
+        np.ravel_multi_index((row - row.min(), column - column.min()), shape),
+        np.full(shape, -np.inf),
+    )
+    np.maximum.at(top.ravel(), cell, xyz[:, 2])
+    counted = weight * (xyz[:, 2] >= top.ravel()[cell] - place.cell_m)
+
+    def total(values: NDArray[Any] | float) -> Float64:
+        return np.bincount(cell, counted * values, top.size).astype(np.float64).reshape(shape)
+
+    return at, total
 
 
 def _surface_heights(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:

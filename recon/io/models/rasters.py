@@ -7,7 +7,6 @@ pixels that are not opaque are unknown, others have costs from 0 to 100 between 
 
 from __future__ import annotations
 
-import math
 import re
 import zlib
 from collections.abc import Iterator, Sequence
@@ -159,13 +158,6 @@ class RasterPlace:
     north: int  # the end of the first row, in cells from the origin
     columns: int
     rows: int
-
-    def in_cells(self, cell_m: float) -> RasterPlace:
-        """Return the same place in cells of another size, as many as cover it."""
-        ratio, ends = self.cell_m / cell_m, (self.west + self.columns, self.north - self.rows)
-        west, south = math.floor(ratio * self.west), math.floor(ratio * ends[1])
-        east, north = math.ceil(ratio * ends[0]), math.ceil(ratio * self.north)
-        return RasterPlace(cell_m, west, north, east - west, north - south)
 
     def cells_of(self, xy_m: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the rows and columns of points (N, 2), metres east and north."""
