@@ -196,3 +196,42 @@ def occupancy(
         settings = run_settings(run, shared.config, shared.changes, preset=shared.preset)
         summary = run_occupancy(run, settings, out=out, threads=shared.threads)
     shared.show(summary)
+
+
+@opt.takes_groups
+def volume(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run, or its map file.")],
+    other: Annotated[
+        Path | None, typer.Argument(help="That of a later run through the same place.")
+    ] = None,
+    height: Annotated[
+        float | None,
+        opt.option("Compare with a level plane there, metres in the map.", min=-1e4, max=1e4),
+    ] = None,
+    within: Annotated[
+        str | None,
+        opt.option("Only there, metres in the map.", metavar="X0,Y0,X1,Y1", default="everywhere"),
+    ] = None,
+    *,
+    shared: opt.Shared,
+) -> None:
+    """Measure what was dug and heaped up between two runs, or above a plane.
+
+    The uppermost points in cells of the grid are compared; cells that one of both
+    lacks are counted, and left out. The standard deviation is that of the points,
+    and of how far two maps differ where nothing changed. A plane is exact.
+
+    Examples:
+      recon volume outputs/monday outputs/friday --within 10,-5,25,5
+      recon volume outputs/yard --height=-1.6 --within 10,-5,25,5 --json
+    """
+    if shared.config is not None or shared.preset is not None or shared.changes:
+        raise typer.BadParameter("runs are compared as the first was mapped: no --config, --set")
+    with shared.one_line_errors():
+        from recon.commands.volume import run_volume
+
+        ends = None if within is None else opt.parse_numbers(within, "--within")
+        summary = run_volume(
+            run, other, height_m=height, within_m=ends, threads=shared.threads or 1
+        )
+    shared.show(summary)

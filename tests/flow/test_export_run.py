@@ -521,3 +521,21 @@ def test_occupied_and_free_are_where_they_really_are(street, tmp_path):
     # The very cell.
     assert 0.95 <= found.grid_exact.iou_free < 1
     assert found.grid.occupied_called_free < 0.05
+
+
+def test_the_volume_of_a_run_above_a_plane(small_demo):
+    done = run("volume", small_demo, "--height=-5", "--within", "4,-1,8,1", "--json")
+    assert done.code == 0, done.err
+    found = json.loads(done.out)
+    area = found["compared_m2"] + found["not_compared_m2"]
+    assert area == pytest.approx(8.0)
+    # A road 1.65 m below the camera.
+    assert found["net_m3"] / found["compared_m2"] == pytest.approx(3.35, abs=0.2)
+    assert 0 < found["sigma_m3"] < 0.5
+    for words, said in (
+        (["--height=1", small_demo], "nothing to compare"),
+        ([], "nothing to compare"),
+        (["--height=1", "--within", "1,2,3"], "not a rectangle"),
+        (["--height=1", "--within", "3,0,1,2"], "not a rectangle"),
+    ):
+        assert_refused(run("volume", small_demo, *words), said)
