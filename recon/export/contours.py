@@ -61,7 +61,7 @@ def contours_product(context: ExportContext, path: Path) -> ExportResult:
         found = drawn.lines(number * interval_m)
         lines, numbers = lines + found, numbers + [number] * len(found)
     levels = np.array(numbers, int)
-    columns = {"height": levels * interval_m, "index": levels % _INDEX == 0}
+    columns = {"height": np.round(levels * interval_m, 9), "index": levels % _INDEX == 0}
     write_lines(path, lines, columns, context.crs)
     return ExportResult(ContourFigures(len(lines), interval_m))
 
