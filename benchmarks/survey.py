@@ -120,6 +120,7 @@ def written(kind: str, fault: str, times_s: Float64, places: Float64, path: Path
 def compared(dsm: Path, true: Float64) -> dict[str, Any]:
     with rasterio.open(dsm) as file:
         ours, to_cell, cell_m = file.read(1), ~file.transform, file.res[0]
+        ours[file.read(2) != 1] = np.nan  # the ground, where no point is
     column, row = (np.floor(each).astype(int) for each in to_cell @ (true[:, 0], true[:, 1]))
     inside = (column >= 0) & (row >= 0) & (column < ours.shape[1]) & (row < ours.shape[0])
     theirs = np.full(ours.shape, -np.inf)

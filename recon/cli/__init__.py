@@ -26,7 +26,7 @@ from recon.cli.getting_started import datasets, demo, doctor, settings
 from recon.cli.map import diff, live, localize, map_, merge, piece
 from recon.cli.options import Commands, option
 from recon.cli.pair import disparity, pair
-from recon.cli.products import export, mesh, occupancy
+from recon.cli.products import export, mesh, occupancy, volume
 from recon.cli.view import view
 
 app = Commands(
@@ -39,7 +39,8 @@ app = Commands(
 _PANELS: Final = {
     "Getting started": (demo, doctor, settings),
     "Reconstruction and mapping": (
-        pair, disparity, map_, localize, live, merge, diff, view, export, mesh, occupancy, batch,
+        pair, disparity, map_, localize, live, merge, diff, view, export, mesh, occupancy,
+        volume, batch,
     ),
     "Cameras and recordings": (board, calibrate, rectify, capture, audit, datasets),
     "Evaluation": (evaluate, paper),

@@ -45,9 +45,9 @@ def export(
         list[str] | None,
         opt.option(
             "cloud, grid, octomap, mesh; costmap (Nav2), esdf (distances, NumPy); for surveying "
-            "programs las, laz, copc, e57, and dsm, dtm, slope, orthophoto, grid-geotiff "
-            "(GeoTIFF); pcd (PCL), npz (NumPy), mcap, gridmap (ROS 2), colmap, nerfstudio, "
-            "texture, web (a page for any server); several with commas.",
+            "programs las, laz, copc, e57, contours (GeoPackage), and dsm, dtm, slope, orthophoto, "
+            "grid-geotiff (GeoTIFF); pcd (PCL), npz (NumPy), mcap, gridmap (ROS 2), colmap, "
+            "nerfstudio, texture, web (a page for any server); several with commas.",
             default="the first four",
         ),
     ] = None,
@@ -70,6 +70,12 @@ def export(
         list[Path] | None,
         opt.option("The drive whose images are needed.", default="where it was mapped"),
     ] = None,
+    gsd: Annotated[
+        float | None,
+        opt.option(
+            "Cell size of the orthophoto in metres.", metavar="METRES", default="that of the images"
+        ),
+    ] = None,
     workers: opt.Workers = None,
     scheduler: opt.Scheduler = None,
     *,
@@ -88,7 +94,7 @@ def export(
       recon export outputs/map/latest --to esdf --resolution 0.1
       recon export outputs/map/latest --to mesh --set mesh.depth=9
       recon export outputs/site --to laz --georeference gnss.txt --crs EPSG:25832
-      recon export outputs/site --to dsm,orthophoto --resolution 0.1
+      recon export outputs/site --to dsm,orthophoto --resolution 0.1 --gsd 0.03
       recon export outputs/city --to grid,octomap --workers 4
     """
     with shared.one_line_errors():
@@ -105,6 +111,7 @@ def export(
             workers=open_workers(workers, scheduler, shared),
             survey=opt.survey_of(georeference, antenna, crs),
             images=images or (),
+            gsd_m=gsd,
         )
     shared.show(summary)
 
@@ -188,4 +195,43 @@ def occupancy(
 
         settings = run_settings(run, shared.config, shared.changes, preset=shared.preset)
         summary = run_occupancy(run, settings, out=out, threads=shared.threads)
+    shared.show(summary)
+
+
+@opt.takes_groups
+def volume(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished run, or its map file.")],
+    other: Annotated[
+        Path | None, typer.Argument(help="That of a later run through the same place.")
+    ] = None,
+    height: Annotated[
+        float | None,
+        opt.option("Compare with a level plane there, metres in the map.", min=-1e4, max=1e4),
+    ] = None,
+    within: Annotated[
+        str | None,
+        opt.option("Only there, metres in the map.", metavar="X0,Y0,X1,Y1", default="everywhere"),
+    ] = None,
+    *,
+    shared: opt.Shared,
+) -> None:
+    """Measure what was dug and heaped up between two runs, or above a plane.
+
+    The uppermost points in cells of the grid are compared; cells that one of both
+    lacks are counted, and left out. The standard deviation is that of the points,
+    and of how far two maps differ where nothing changed. A plane is exact.
+
+    Examples:
+      recon volume outputs/monday outputs/friday --within 10,-5,25,5
+      recon volume outputs/yard --height=-1.6 --within 10,-5,25,5 --json
+    """
+    if shared.config is not None or shared.preset is not None or shared.changes:
+        raise typer.BadParameter("runs are compared as the first was mapped: no --config, --set")
+    with shared.one_line_errors():
+        from recon.commands.volume import run_volume
+
+        ends = None if within is None else opt.parse_numbers(within, "--within")
+        summary = run_volume(
+            run, other, height_m=height, within_m=ends, threads=shared.threads or 1
+        )
     shared.show(summary)

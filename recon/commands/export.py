@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from shutil import copyfile
-from typing import Any
+from typing import Any, Final
 
 from recon.commands.config import (
     REMADE,
@@ -47,6 +47,8 @@ from recon.run.finished import (
 )
 from recon.run.run import Run
 
+_GSD_M: Final = (1e-4, 10.0)
+
 
 def run_export(
     source: StrPath,
@@ -59,6 +61,7 @@ def run_export(
     workers: BatchOptions | None = None,
     survey: Survey | None = None,
     images: Sequence[Path] = (),
+    gsd_m: float | None = None,
     command: str = "export",
 ) -> ExportSummary | CloudSummary:
     """Make products of a finished run, and write them: what `recon export` does.
@@ -75,6 +78,7 @@ def run_export(
         survey: Measured positions in whose coordinates products of surveys are written; None = in
             those of the map.
         images: Where drives are now whose images are needed, if not where they were mapped.
+        gsd_m: Edge of a cell of the orthophoto, metres; None = as large as a pixel on the ground.
         command: Command name, for the record and the default folder.
 
     Raises:
@@ -96,6 +100,11 @@ def run_export(
         what = "only grids and OctoMaps are made on workers"
         hint = "drop --workers and --scheduler; a mesh uses --threads"
         raise SettingsError(what, got=", ".join(wanted), hint=hint)
+    if gsd_m is not None and not ("orthophoto" in wanted and _GSD_M[0] <= gsd_m <= _GSD_M[1]):
+        expected = "{:g} to {:g} m, for --to orthophoto".format(*_GSD_M)
+        raise SettingsError(
+            "not a cell of an orthophoto", where="--gsd", got=gsd_m, expected=expected
+        )
     mapped_by = None if pair else command_of_map(source)
     ran = run_settings(source)
     settings = config or ran
@@ -112,7 +121,9 @@ def run_export(
         if survey is not None:
             with run.stage("survey"):
                 there = locate(map_, survey, images, run.threads)
-        context = ExportContext(map_, placed, settings.mesh, formats, run.threads, there, images)
+        context = ExportContext(
+            map_, placed, settings.mesh, formats, run.threads, there, images, gsd_m
+        )
         made = make(context, run.content, wanted, run.watch)
         if there is not None and survey is not None:
             with run.stage("accuracy"):

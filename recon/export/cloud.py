@@ -14,11 +14,18 @@ from numpy.typing import NDArray
 
 from recon.core.kernels import voxels
 from recon.core.values import PointCloud, join_clouds
-from recon.core.values.arrays import Bool
+from recon.core.values.arrays import Bool, UInt8
 from recon.export.occupancy import GROUND_RATIO, Flattening
 from recon.export.product import ExportContext, ExportResult, PointFigures
 from recon.io.models.columns import write_npz, write_pcd
-from recon.io.models.las import write_copc, write_e57, write_las
+from recon.io.models.las import (
+    ABOVE_GROUND,
+    GROUND,
+    UNCLASSIFIED,
+    write_copc,
+    write_e57,
+    write_las,
+)
 from recon.io.models.ply import write_ply_tiles
 from recon.map.ground.surface import MAX_TILT_DEG, WINDOW_M, GroundSurface
 from recon.map.tiles import Tiles
@@ -143,21 +150,25 @@ class CloudSample:
 def las_product(
     context: ExportContext, path: Path, write: Callable[..., int] = write_las
 ) -> ExportResult:
-    """Write the cloud as LAS or LAZ, with the ground as a class, perhaps where a survey says."""
+    """Write the cloud as LAS or LAZ with classes of points, perhaps where a survey says."""
     clouds = (tile.cloud for tile in context.placed.tiles)
     # A hundredth of a voxel, as a decimal: a millimetre on a road.
     step_m = 10.0 ** math.floor(math.log10(context.placed.tiles.config.fusion.voxel_m) - 2.0)
     tiles, known = context.placed.tiles, dict(Flattening(context.placed).grounds())
 
-    def are_ground(cloud: PointCloud) -> Bool:
-        """Return which points of a tile are ground; far from the path, none is known to be."""
+    def classify(cloud: PointCloud) -> UInt8:
+        """Return the classes of points of a tile; far from the path, no ground is known."""
         if not len(cloud):
-            return np.zeros(0, np.bool_)
+            return np.zeros(0, np.uint8)
         column, row = (cloud.xyz[0, :2] // tiles.edge_m).astype(int).tolist()
         surface = known.get(tiles.bounds((column, row)))
-        return np.zeros(len(cloud), np.bool_) if surface is None else ground_points(cloud, surface)
+        if surface is None:
+            return np.full(len(cloud), UNCLASSIFIED, np.uint8)
+        above = cloud.xyz[:, 2] > surface.height_at(cloud.xyz[:, :2])
+        classes = np.where(above, ABOVE_GROUND, UNCLASSIFIED)
+        return np.where(ground_points(cloud, surface), GROUND, classes).astype(np.uint8)
 
-    how = {"step_m": step_m, "ground": are_ground}
+    how = {"step_m": step_m, "classify": classify}
     return ExportResult(PointFigures(write(path, clouds, context.T_survey_map, context.crs, **how)))
 
 

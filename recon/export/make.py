@@ -26,6 +26,7 @@ from recon.export.cloud import (
     pcd_product,
 )
 from recon.export.colmap import colmap_product
+from recon.export.contours import contours_product
 from recon.export.costmap import costmap_product, gridmap_product
 from recon.export.mcap import mcap_product
 from recon.export.mesh.pieces import mesh_product
@@ -38,6 +39,7 @@ from recon.export.occupancy import (
     grid_product,
     octomap_product,
 )
+from recon.export.orthophoto import orthophoto_product
 from recon.export.product import ExportContext, ExportResult, Product, ProductFigures
 from recon.export.rasters import RASTERS, raster_product, stem_of
 from recon.export.web import web_product
@@ -64,6 +66,14 @@ PRODUCTS: Final[Mapping[str, Product]] = {
         )
         for name in RASTERS
     },
+    "orthophoto": Product(
+        "map/orthophoto.tif",
+        orthophoto_product,
+        needs_occupancy=True,
+        surveyed=True,
+        needs_images=True,
+    ),
+    "contours": Product("map/contours.gpkg", contours_product, needs_occupancy=True, surveyed=True),
     "las": Product("map/cloud.las", las_product, surveyed=True),
     "laz": Product("map/cloud.laz", las_product, surveyed=True),
     "copc": Product("map/cloud.copc.laz", copc_product, surveyed=True),

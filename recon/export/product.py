@@ -42,6 +42,7 @@ class ExportContext:
     # Where the map is in a survey, as products of surveys are written; None = in its own axes
     survey: Georeference | None = None
     images: Sequence[Path] = ()  # where drives are now, if not where the map says
+    gsd_m: float | None = None  # edge of a cell of the orthophoto; None = as a pixel on the ground
 
     @cached_property
     def drives(self) -> list[DriveImages]:

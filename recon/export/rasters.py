@@ -10,15 +10,16 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.core.errors import MappingError
 from recon.core.geometry.se3 import apply, invert
-from recon.core.summary import inline
-from recon.core.values import UNKNOWN, PointCloud
-from recon.core.values.arrays import Bool, Float64, Int64
+from recon.core.summary import inline, optional
+from recon.core.values import UNKNOWN
+from recon.core.values.arrays import Float64
 from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.io.models.rasters import RasterFile, RasterPlace, write_geotiff
@@ -27,6 +28,8 @@ from recon.map.ground.surface import GroundSurface
 _ROWS: Final = 256  # of a raster at a time
 _CORNERS: Final = np.array([*product((0.0, 1.0), repeat=2)])
 Fill = Callable[[ExportContext, RasterFile, Float64], None]
+Measure = Callable[[GroundSurface, Float64, Float64], Float64]
+"""Measures a ground at places (N, 2) of a map, given what leads to the file: (N,)."""
 
 
 def stem_of(name: str) -> str:
@@ -39,89 +42,78 @@ class RasterFigures(ProductFigures):
     """The size of a raster."""
 
     size: Mapping[str, tuple[int, int]] = inline()  # columns and rows, by its key
+    gsd_m: float | None = optional()  # edge of a cell of the orthophoto
 
     @property
     def text(self) -> str:
-        return ", ".join(f"{columns} × {rows} cells" for columns, rows in self.size.values())
+        cells = ", ".join(f"{columns} × {rows} cells" for columns, rows in self.size.values())
+        return cells if self.gsd_m is None else f"{cells} of {self.gsd_m:g} m"
 
 
 def raster_product(name: str) -> Callable[[ExportContext, Path], ExportResult]:
     """Return what writes one of `RASTERS`, perhaps in survey coordinates."""
-    fill, colours = RASTERS[name]
+    fill, unit, bands = RASTERS[name]
 
     def write(context: ExportContext, path: Path) -> ExportResult:
-        T_file_map = context.T_survey_map
-        place = _place(context, T_file_map)
-        with write_geotiff(path, place, colours=colours, crs=context.crs) as file:
-            fill(context, file, T_file_map)
+        place = place_of(context, context.placed.tiles.resolution_m)
+        with write_geotiff(path, place, bands=bands, unit=unit, crs=context.crs) as file:
+            fill(context, file, context.T_survey_map)
         size = (place.columns, place.rows)
         return ExportResult(RasterFigures({f"{stem_of(name)}_size": size}))
 
     return write
 
 
-def _place(context: ExportContext, T_file_map: Float64) -> RasterPlace:
-    """Return the cells that have all points, as large as those of the grid."""
+def place_of(context: ExportContext, cell_m: float) -> RasterPlace:
+    """Return cells, north up in the coordinates of the survey, that have all points of the map."""
     clouds = (tile.cloud.xyz.astype(np.float64) for tile in context.placed.tiles)
-    seen = [apply(T_file_map, xyz)[:, :2] for xyz in clouds if len(xyz)]
+    seen = [apply(context.T_survey_map, xyz)[:, :2] for xyz in clouds if len(xyz)]
     if not seen:
         raise MappingError("the map is empty: there is nothing to see from above")
-    cell_m = context.placed.tiles.resolution_m
     west, south = np.floor(np.min([xy.min(axis=0) for xy in seen], axis=0) / cell_m).astype(int)
     east, north = np.floor(np.max([xy.max(axis=0) for xy in seen], axis=0) / cell_m).astype(int) + 1
     return RasterPlace(cell_m, int(west), int(north), int(east - west), int(north - south))
 
 
-class _Seen(NamedTuple):
-    """What is seen of a tile from above."""
+def columns_of(
+    place: RasterPlace, xyz: Float64, weight: NDArray[Any] | float
+) -> tuple[tuple[slice, slice], Callable[[NDArray[Any] | float], Float64]]:
+    """Return the cells around points (N, 3), and what sums up values (N,) of the uppermost there.
 
-    row: int  # first row of the raster
-    column: int
-    top: Int64  # (R, C), the highest point of each cell; -1 = none
-    cloud: PointCloud
-    height_m: Float64  # of its points
+    These are no lower than the highest by more than a cell is wide: of one surface, if it is no
+    steeper than 45°. Values are multiplied by the weights; sums are (rows, columns).
+    """
+    row, column = place.cells_of(xyz[:, :2])
+    at = np.s_[row.min() : row.max() + 1, column.min() : column.max() + 1]
+    shape = int(np.ptp(row)) + 1, int(np.ptp(column)) + 1
+    cell, top = (
+        np.ravel_multi_index((row - row.min(), column - column.min()), shape),
+        np.full(shape, -np.inf),
+    )
+    np.maximum.at(top.ravel(), cell, xyz[:, 2])
+    counted = weight * (xyz[:, 2] >= top.ravel()[cell] - place.cell_m)
 
-    @property
-    def known(self) -> Bool:
-        return np.asarray(self.top >= 0)
+    def total(values: NDArray[Any] | float) -> Float64:
+        return np.bincount(cell, counted * values, top.size).astype(np.float64).reshape(shape)
 
-
-def _seen(context: ExportContext, place: RasterPlace, T_file_map: Float64) -> Iterator[_Seen]:
-    for tile in context.placed.tiles:
-        cloud = tile.cloud
-        if not len(cloud):
-            continue
-        xyz = apply(T_file_map, cloud.xyz.astype(np.float64))
-        row, column = place.cells_of(xyz[:, :2])
-        first = int(row.min()), int(column.min())
-        top = np.full((int(np.ptp(row)) + 1, int(np.ptp(column)) + 1), -1)
-        # The last point that is written into a cell stays.
-        upwards = np.argsort(xyz[:, 2], kind="stable")
-        top[row[upwards] - first[0], column[upwards] - first[1]] = upwards
-        yield _Seen(*first, top, cloud, xyz[:, 2])
+    return at, total
 
 
 def _surface_heights(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
-    """Write the height of the highest point of each cell."""
-    for one in _seen(context, file.place, T_file_map):
-        before = file.read(one.row, one.column, one.top.shape)
-        heights = np.where(one.known, one.height_m[one.top], np.nan).astype(np.float32)
-        file.write(one.row, one.column, np.fmax(before, heights))
+    """Write the height of the highest point of each cell; elsewhere that of the ground, marked."""
+    for cloud in filter(len, (tile.cloud for tile in context.placed.tiles)):
+        xyz = apply(T_file_map, cloud.xyz.astype(np.float64))
+        row, column = file.place.cells_of(xyz[:, :2])
+        first = int(row.min()), int(column.min())
+        top = np.full((2, int(np.ptp(row)) + 1, int(np.ptp(column)) + 1), np.nan, np.float32)
+        np.fmax.at(top[0], (row - first[0], column - first[1]), xyz[:, 2])
+        top[1, ~np.isnan(top[0])] = 1.0
+        file.write(*first, np.fmax(file.read(*first, top.shape[1:]), top))
+    _ground(context, file, T_file_map, measure=ground_heights, shown=False)
 
 
-def _surface_colours(context: ExportContext, file: RasterFile, T_file_map: Float64) -> None:
-    """Write the colour of the highest point of each cell; where tiles meet, of the first tile."""
-    for one in _seen(context, file.place, T_file_map):
-        if one.cloud.rgb is None:
-            raise MappingError("the points of the map have no colours")
-        before = file.read(one.row, one.column, one.top.shape)
-        opaque = np.where(one.known, 255, 0)[None]
-        colours = np.where(one.known, one.cloud.rgb[one.top].transpose(2, 0, 1), 0)
-        colours = np.concatenate([colours, opaque]).astype(np.uint8)
-        file.write(one.row, one.column, np.where(before[3] > 0, before, colours))
-
-
-def _ground_heights(ground: GroundSurface, xy_m: Float64, T_file_map: Float64) -> Float64:
+def ground_heights(ground: GroundSurface, xy_m: Float64, T_file_map: Float64) -> Float64:
+    """Return the heights (N,) of the ground in a file, at places (N, 2) of the map."""
     xyz = np.column_stack([xy_m, ground.height_at(xy_m)])
     return np.asarray(apply(T_file_map, xyz)[:, 2])
 
@@ -149,15 +141,16 @@ def _flat_grid(context: ExportContext, file: RasterFile, T_file_map: Float64) ->
         file.write(row, 0, values.reshape(1, *shape))
 
 
-def _ground(
-    context: ExportContext,
-    file: RasterFile,
-    T_file_map: Float64,
-    *,
-    measure: Callable[[GroundSurface, Float64, Float64], Float64],
-) -> None:
-    """Write what is measured of the ground of each tile at the middles of cells."""
-    T_map_file, place = invert(T_file_map), file.place
+def ground_blocks(
+    context: ExportContext, place: RasterPlace, measure: Measure
+) -> Iterator[tuple[int, int, Float64]]:
+    """Yield blocks with a row and a column: what is measured of the ground at middles of cells.
+
+    float64 (2, rows, columns): NaN = unknown, or not of this block; and whether points show it (1),
+    or it was carried over from cells beside (0).
+    """
+    T_file_map = context.T_survey_map
+    T_map_file = invert(T_file_map)
     for bounds, ground in Flattening(context.placed).grounds():
         low, high = np.array(bounds.low), np.array(bounds.high)
         corners = np.pad(low + _CORNERS * (high - low), ((0, 0), (0, 1)))
@@ -169,16 +162,31 @@ def _ground(
         # The map's own level, for the place of a cell in a map that is tilted against the survey.
         level = np.full((len(middles), 1), T_file_map[2, 3])
         xy_m = apply(T_map_file, np.hstack([middles, level]))[:, :2]
-        inside, values = bounds.contains(xy_m), np.full(len(xy_m), np.nan, np.float32)
-        values[inside] = measure(ground, xy_m[inside], T_file_map)
-        file.write(*first, np.fmax(file.read(*first, shape), values.reshape(shape)))
+        inside, values = bounds.contains(xy_m), np.full((2, len(xy_m)), np.nan)
+        values[0, inside] = measure(ground, xy_m[inside], T_file_map)
+        values[1, inside] = ground.measured_at(xy_m[inside])
+        values[1, np.isnan(values[0])] = np.nan
+        yield *first, values.reshape(2, *shape)
 
 
-RASTERS: Final[dict[str, tuple[Fill, bool]]] = {
-    "dsm": (_surface_heights, False),
-    "dtm": (partial(_ground, measure=_ground_heights), False),
-    "slope": (partial(_ground, measure=lambda *at: np.degrees(ground_slopes(*at[:2]))), False),
-    "orthophoto": (_surface_colours, True),
-    "grid-geotiff": (_flat_grid, False),
+def _ground(
+    context: ExportContext, file: RasterFile, _: Float64, *, measure: Measure, shown: bool = True
+) -> None:
+    """Write what is measured of the ground where nothing is yet, perhaps as not ``shown``."""
+    for row, column, values in ground_blocks(context, file.place, measure):
+        before = file.read(row, column, values.shape[1:])
+        values[1] *= shown
+        file.write(row, column, np.where(np.isnan(before), values, before).astype(np.float32))
+
+
+RASTERS: Final[dict[str, tuple[Fill, str, tuple[str, ...]]]] = {
+    "dsm": (_surface_heights, "metre", ("height", "measured")),
+    "dtm": (partial(_ground, measure=ground_heights), "metre", ("height", "measured")),
+    "slope": (
+        partial(_ground, measure=lambda *at: np.degrees(ground_slopes(*at[:2]))),
+        "degree",
+        ("slope", "measured"),
+    ),
+    "grid-geotiff": (_flat_grid, "percent", ("occupied",)),
 }
-"""What fills a raster, and whether it is one of colours."""
+"""What fills a raster, the unit of its first band, and the names of all."""

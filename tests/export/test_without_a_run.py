@@ -22,6 +22,7 @@ CONFIG = recon.load_config(
 )
 TOOLS = {"las": "laspy", "laz": "laspy", "copc": "laspy", "e57": "pye57", "mcap": "rosbags",
          "gridmap": "rosbags", "colmap": "pycolmap"}  # fmt: skip
+TOOLS |= {"contours": "pyogrio"}
 TOOLS |= dict.fromkeys(("dsm", "dtm", "slope", "orthophoto", "grid-geotiff"), "rasterio")
 
 

@@ -93,13 +93,14 @@ def test_the_cloud_comes_as_laz_and_e57_in_survey_coordinates_and_as_arrays(smal
     assert np.abs(found.xyz - expected).max() < 0.002
     assert found.header.parse_crs().to_epsg() == 25832
     assert summary_of(out)["misfit_rms_m"] < 0.001
-    # 2 is ground, which is a plane here but for kerbs, and all else is not classified, 1.
-    assert set(found.classification) == {1, 2}
+    # 2 is ground, which is a plane here but for kerbs; 64 is what stands on it, 1 is not known.
+    assert set(found.classification) <= {1, 2, 64}
     ground = np.asarray(found.classification) == 2
     level = np.column_stack([cloud.xyz[:, :2], np.ones(len(cloud))]).astype(np.float64)
     plane = np.linalg.lstsq(level[ground], cloud.xyz[ground, 2], rcond=None)[0]
     above_m = cloud.xyz[:, 2] - level @ plane
     assert np.abs(above_m[ground]).max() < 0.3
+    assert (np.asarray(found.classification)[above_m > 0.5] == 64).mean() > 0.9
     assert ground[np.abs(above_m) < 0.02].mean() > 0.8
     with pytest.importorskip("pye57").E57(str(out / "map/cloud.e57")) as file:
         scans = [file.read_scan(n, colors=True) for n in range(file.scan_count)]
@@ -183,15 +184,19 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
         with rasterio.open(out / f"map/{name}.tif") as file:
             assert np.isnan(file.nodata)
             assert not np.isinf(file.read(1)).any()
-            assert np.isnan(file.read(1)).any() or name in ("dtm", "slope")  # ground goes on
+            assert np.isnan(file.read(1)).any() == (name == "grid")  # ground goes on
     # A point in the survey may be rounded into the next cell.
     assert np.mean(at_points("dsm") >= xyz[:, 2] - 1e-3) > 0.98
     highest = np.abs(at_points("dsm") - xyz[:, 2]) < 1e-3
     assert 0.1 < highest.mean() < 1
-    assert (at_points("orthophoto", 4) == 255).mean() > 0.98
+    seen = at_points("orthophoto", 4) == 255
+    assert seen.mean() > 0.7
     with rasterio.open(out / "map/orthophoto.tif") as file:  # else GIS draw what is unknown black
         assert file.colorinterp[3] == rasterio.enums.ColorInterp.alpha
-    assert np.mean(at_points("orthophoto")[highest] == cloud.rgb[highest, 0]) > 0.85
+        assert file.res[0] == summary_of(out)["gsd_m"] < 0.2
+    off = at_points("orthophoto").astype(float) - cloud.rgb[:, 0]
+    assert np.median(np.abs(off[seen & highest])) < 10
+    assert np.abs(np.mean(off[seen & highest])) < 5
     # The base is driven over the ground, from where it is seen on; the rendered street is level.
     ahead = there[-1, 1:] - there[0, 1:]
     driven = there[-2:, 1:] + 8.0 * ahead / np.linalg.norm(ahead)
@@ -207,6 +212,37 @@ def test_rasters_show_the_map_from_above_where_the_survey_says(small_demo, tmp_p
     # A turned cell has the middle of another one: some at the edge of what stands are free.
     assert found.size > 100
     assert np.mean(found == OCCUPIED) > 0.7
+
+
+def test_rasters_say_which_cells_points_show_and_are_read_from_afar(small_demo, tmp_path):
+    rasterio, out = pytest.importorskip("rasterio"), tmp_path / "out"
+    assert run("export", small_demo, "--to", "dsm,dtm,slope,grid-geotiff", "--out", out).code == 0
+    found = {}
+    for name, unit in (
+        ("dsm", "metre"),
+        ("dtm", "metre"),
+        ("slope", "degree"),
+        ("grid", "percent"),
+    ):
+        with rasterio.open(out / f"map/{name}.tif") as file:
+            assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+            assert file.units[0] == unit
+            names = {"grid": ("occupied",), "slope": ("slope", "measured")}
+            assert file.descriptions == names.get(name, ("height", "measured"))
+            found[name] = file.read()
+            place = file.transform
+    (surface, shown), (ground, known) = found["dsm"], found["dtm"]
+    # The surface has the extent of the ground, and is the ground where no point lies.
+    assert not np.isnan(surface[~np.isnan(ground)]).any()
+    np.testing.assert_array_equal(surface[shown == 0], ground[shown == 0])
+    assert 0.05 < (shown == 0).mean() < 0.95
+    xyz = read_ply(small_demo / "map/cloud.ply").xyz
+    row, column = rasterio.transform.rowcol(place, *xyz[:, :2].astype(np.float64).T)
+    assert (shown[row, column] == 1).mean() > 0.99  # but for one at the edge of a cell
+    assert shown.sum() <= len(xyz)
+    # Cells of the ground, a metre wide, have some points or are carried over from others.
+    assert {*np.unique(known[~np.isnan(ground)])} == {0.0, 1.0}
+    assert (known[(shown == 1) & (surface - ground < 0.05)] == 1).mean() > 0.9
 
 
 @pytest.mark.parametrize(("options", "said"), [
@@ -485,3 +521,21 @@ def test_occupied_and_free_are_where_they_really_are(street, tmp_path):
     # The very cell.
     assert 0.95 <= found.grid_exact.iou_free < 1
     assert found.grid.occupied_called_free < 0.05
+
+
+def test_the_volume_of_a_run_above_a_plane(small_demo):
+    done = run("volume", small_demo, "--height=-5", "--within", "4,-1,8,1", "--json")
+    assert done.code == 0, done.err
+    found = json.loads(done.out)
+    area = found["compared_m2"] + found["not_compared_m2"]
+    assert area == pytest.approx(8.0)
+    # A road 1.65 m below the camera.
+    assert found["net_m3"] / found["compared_m2"] == pytest.approx(3.35, abs=0.2)
+    assert 0 < found["sigma_m3"] < 0.5
+    for words, said in (
+        (["--height=1", small_demo], "nothing to compare"),
+        ([], "nothing to compare"),
+        (["--height=1", "--within", "1,2,3"], "not a rectangle"),
+        (["--height=1", "--within", "3,0,1,2"], "not a rectangle"),
+    ):
+        assert_refused(run("volume", small_demo, *words), said)

@@ -16,7 +16,7 @@ from recon.core.errors import EvaluationError, SettingsError, require
 from recon.core.geometry.se3 import apply
 from recon.core.kernels.voxels import KEY_BITS, pack_keys
 from recon.core.values import PointCloud
-from recon.core.values.arrays import Bool, Float64, Int64
+from recon.core.values.arrays import Float64, Int64, UInt8
 from recon.io.atomic import atomic_path
 from recon.io.files import StrPath
 from recon.io.models.columns import columns_of, with_first
@@ -27,7 +27,9 @@ _STEP_M: Final = 0.001
 _MARGIN_DEG: Final = 6.0  # systems are used as far outside their area as a zone of UTM is wide
 _LARGEST_STRETCH: Final = 2.0  # of a metre on the ground: Mercator's at 60 degrees north
 _FULL_COLOUR: Final = 257  # colours have 16 bits: 255 becomes 65535
-AreGround = Callable[[PointCloud], Bool]  # which points of a cloud are ground, (N,)
+UNCLASSIFIED, GROUND, ABOVE_GROUND = 1, 2, 64  # ASPRS leaves classes from 64 on to users
+Classify = Callable[[PointCloud], UInt8]
+"""Returns the class of each point of a cloud, uint8 (N,)."""
 
 
 def write_las(
@@ -36,13 +38,14 @@ def write_las(
     T_to_from: Float64,
     crs: str | None = None,
     step_m: float = _STEP_M,
-    ground: AreGround | None = None,
+    classify: Classify | None = None,
 ) -> int:
     """Write clouds into one LAS 1.4 file, atomically, compressed in ``.laz``; returns their points.
 
     Positions are rounded to ``step_m``; colours and, as extra dimensions, what else `ATTRIBUTES`
     say are those of the first cloud. ``T_to_from`` (4, 4) leads to the coordinates of the file, in
-    the system ``crs``. Points that ``ground`` says are ground have class 2, others 1, unclassified.
+    the system ``crs``. Without ``classify`` all points are unclassified; those that are inferred
+    have the flag of synthetic ones.
 
     Ref: ASPRS, "LAS specification 1.4 - R15", 2019.
     """
@@ -54,7 +57,7 @@ def write_las(
         laspy.open(temporary, mode="w", header=header, do_compress=packed) as file,
     ):
         for cloud in clouds:
-            file.write_points(las_record(laspy, header, cloud, T_to_from, ground))
+            file.write_points(las_record(laspy, header, cloud, T_to_from, classify))
             points += len(cloud)
     return points
 
@@ -81,6 +84,9 @@ def las_header(
     for each, _ in first.attributes:
         if each.las and each.width == 1:
             header.add_extra_dim(laspy.ExtraBytesParams(*each.las, each.dtype, each.about))
+    names = laspy.vlrs.known.ClassificationLookupVlr()
+    names.lookups = dict.fromkeys(range(256), "") | {ABOVE_GROUND: "above ground"}
+    header.vlrs.append(names)
     if crs is not None:
         header.add_crs(check_crs(crs))
     return header
@@ -147,12 +153,13 @@ def _check_metres(system: Any, lons: Float64, lats: Float64, where: StrPath) -> 
 
 
 def las_record(
-    laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64, ground: AreGround | None
+    laspy: Any, header: Any, cloud: PointCloud, T_to_from: Float64, classify: Classify | None
 ) -> Any:
     """Return the points of a cloud as they are in a file with this header."""
     record = laspy.ScaleAwarePointRecord.zeros(len(cloud), header=header)
     record.return_number[:] = record.number_of_returns[:] = 1  # 0 is not permitted
-    record.classification[:] = 1 if ground is None else np.where(ground(cloud), 2, 1)
+    record.classification[:] = UNCLASSIFIED if classify is None else classify(cloud)
+    record.synthetic[:] = 0 if cloud.inferred is None else cloud.inferred
     record.x, record.y, record.z = apply(T_to_from, cloud.xyz.astype(np.float64)).T
     for name, values in columns_of(cloud, "las").items():
         own = name in header.point_format.extra_dimension_names
@@ -177,7 +184,7 @@ def write_copc(
     crs: str | None = None,
     *,
     step_m: float,
-    ground: AreGround | None = None,
+    classify: Classify | None = None,
 ) -> int:
     """Write clouds into one COPC file as `write_las` does, with all points in memory.
 
@@ -186,7 +193,7 @@ def write_copc(
     laspy, lazrs = require("laspy", extra=_EXTRA), require("lazrs", extra=_EXTRA)
     first, clouds = with_first(clouds)
     header = las_header(laspy, first, T_to_from, crs, step_m)
-    records = [las_record(laspy, header, cloud, T_to_from, ground) for cloud in clouds]
+    records = [las_record(laspy, header, cloud, T_to_from, classify) for cloud in clouds]
     points = laspy.ScaleAwarePointRecord.empty(header=header)
     points.array = np.concatenate([points.array, *(one.array for one in records)])
     steps = np.stack([points.array[axis] for axis in "XYZ"], axis=1).astype(np.int64)

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -145,6 +146,7 @@ def _read_pgm(path: Path) -> UInt8:
 _EXTRA: Final = "survey"
 _BLOCK_PX: Final = 256  # a multiple of 16, by the specification
 _MOST_CELLS: Final = 4_000_000_000  # 6 by 6 km at 0.1 m
+COLOUR_BANDS: Final = ("red", "green", "blue", "alpha")  # of uint8; others are float32
 
 
 @dataclass(frozen=True)
@@ -188,38 +190,54 @@ class RasterFile:
 
 @contextmanager
 def write_geotiff(
-    path: StrPath, place: RasterPlace, *, colours: bool, crs: str | None
+    path: StrPath, place: RasterPlace, *, bands: Sequence[str], unit: str = "", crs: str | None
 ) -> Iterator[RasterFile]:
-    """Open a GeoTIFF to be written: float32 with NaN where nothing is known, or colours with alpha.
+    """Open a GeoTIFF to be written: float32 with NaN where nothing is known, or `COLOUR_BANDS`.
 
-    Only what is written takes room; the file appears when all is done. A raster that is too large
-    is an `OutputError`.
+    Bands have names, the first one a unit. Only what is written takes room; the file appears when
+    all is done, in the cloud-optimised layout with overviews. A raster that is too large is an
+    `OutputError`.
 
-    Ref: OGC 19-008r4, "OGC GeoTIFF Standard", 2019.
+    Ref: OGC 21-026, "OGC Cloud Optimized GeoTIFF Standard", 2023.
     """
     rasterio = require("rasterio", extra=_EXTRA)
+    copying = require("rasterio.shutil", extra=_EXTRA)
     if place.columns * place.rows > _MOST_CELLS:
         got, expected = f"{place.columns} x {place.rows} cells", f"at most {_MOST_CELLS:g} cells"
         raise OutputError("the raster is too large", where=path, got=got, expected=expected)
-    kind: dict[str, Any] = {"count": 1, "dtype": "float32", "nodata": float("nan")}
-    if colours:
-        kind = {"count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "yes"}
+    coloured = bands == COLOUR_BANDS
+    kind: dict[str, Any] = {"dtype": "float32", "nodata": float("nan")}
+    if coloured:
+        kind = {"dtype": "uint8", "photometric": "RGB", "alpha": "yes"}
+    packed: dict[str, Any] = {"compress": "deflate", "bigtiff": "if_safer", "sparse_ok": True}
     west_m, north_m = place.west * place.cell_m, place.north * place.cell_m
-    with atomic_path(path) as temporary:
+    with (
+        atomic_path(path) as temporary,
+        TemporaryDirectory(prefix=".raster-", dir=temporary.parent) as folder,
+    ):
+        draft, final = Path(folder) / "draft.tif", Path(folder) / "final.tif"
         with rasterio.open(
-            temporary, "w+", driver="GTiff", width=place.columns, height=place.rows,
+            draft, "w+", driver="GTiff", width=place.columns, height=place.rows,
             transform=rasterio.Affine(place.cell_m, 0, west_m, 0, -place.cell_m, north_m),
             crs=None if crs is None else check_crs(crs).to_wkt(), tiled=True, blockxsize=_BLOCK_PX,
-            blockysize=_BLOCK_PX, compress="deflate", bigtiff="if_safer", sparse_ok=True, **kind,
+            blockysize=_BLOCK_PX, count=len(bands), **packed, **kind,
         ) as dataset:  # fmt: skip
+            dataset.descriptions = bands
+            dataset.set_band_unit(1, unit)
             yield RasterFile(dataset, rasterio.windows.Window, place)
             written = _checksums(dataset)
-        # What is left is written when the file is closed, without an error if there is no room.
-        whole = False
-        with suppress(rasterio.errors.RasterioIOError), rasterio.open(temporary) as dataset:
-            whole = _checksums(dataset) == written
+        # What is left is written when a file is closed, without an error if there is no room.
+        whole, smaller = False, "average" if coloured else "nearest"  # a flag has no mean
+        with suppress(rasterio.errors.RasterioError, rasterio._err.CPLE_BaseError):
+            copying.copy(
+                draft, final, driver="COG", blocksize=_BLOCK_PX, overview_resampling=smaller,
+                **packed,
+            )  # fmt: skip
+            with rasterio.open(final) as dataset:
+                whole = _checksums(dataset) == written
         if not whole:
             raise OSError("parts of it are missing")
+        final.replace(temporary)
 
 
 def _checksums(dataset: Any) -> list[int]:

@@ -75,10 +75,14 @@ class GroundSurface:
     # float64 (rows, columns), commonest height of the path above the points below it; NaN = too few
     # points, or no path. None = not measured.
     drops_m: Float64 | None = None
+    # bool (rows, columns), whether points show the height: others are carried over from cells
+    # beside. None = all.
+    measured: Bool | None = None
 
     def __post_init__(self) -> None:
         freeze(self, "heights_m", np.float64, (None, None))
         freeze(self, "drops_m", np.float64, self.heights_m.shape)
+        freeze(self, "measured", np.bool_, self.heights_m.shape)
 
     def height_at(self, xy: NDArray[Any]) -> Float64:
         """Return heights at places (N, 2), bilinear; NaN where that of their cell is unknown."""
@@ -100,8 +104,19 @@ class GroundSurface:
         """Return `drops_m` of the cells of places (N, 2); float64 (N,), NaN = unknown."""
         if self.drops_m is None:
             return np.full(len(xy), np.nan)
-        column, row = np.floor((np.asarray(xy, np.float64) - self.origin_m) / self.cell_m).T
+        row, column = self._place(xy)
         return self._cells(row, column, self.drops_m)
+
+    def measured_at(self, xy: NDArray[Any]) -> Bool:
+        """Return bool (N,), whether points show the height of the cells of places (N, 2)."""
+        values = self.heights_m if self.measured is None else np.where(self.measured, 1, np.nan)
+        row, column = self._place(xy)
+        return np.isfinite(self._cells(row, column, values))
+
+    def _place(self, xy: NDArray[Any]) -> Float64:
+        """Return float64 (2, N), rows and columns of the cells of places (N, 2)."""
+        column, row = np.floor((np.asarray(xy, np.float64) - self.origin_m) / self.cell_m).T
+        return np.stack([row, column])
 
     def _cells(self, row: Float64, column: Float64, values: Float64 | None = None) -> Float64:
         """Return values of cells, by default heights; NaN outside the surface."""
@@ -136,6 +151,7 @@ def estimate_ground_surface(
         origin_m=field.origin,
         camera_height_m=camera_height,
         drops_m=field.drops(),
+        measured=known & field.measured,
     )
 
 
