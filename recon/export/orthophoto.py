@@ -28,7 +28,7 @@ from recon.core.progress import tracked
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, UInt8
 from recon.core.values.camera import project
-from recon.export.mesh.views import PosedImage, posed_images
+from recon.export.mesh.views import PosedImage, posed_images, sampled
 from recon.export.occupancy import Flattening
 from recon.export.product import ExportContext, ExportResult
 from recon.export.rasters import RasterFigures, columns_of, ground_blocks, ground_heights, place_of
@@ -45,7 +45,6 @@ _DARK: Final = 8  # below, exposures cannot be compared
 _AROUND: Final = (5, 5)  # cells over which noise is averaged
 _STRIDE: Final = 4  # of the cells whose pixels are looked at for the size of all
 _ROWS: Final = 256  # of a raster at a time
-_LONGEST: Final = 1 << 14  # row that OpenCV takes
 
 
 def orthophoto_product(context: ExportContext, path: Path) -> ExportResult:
@@ -89,11 +88,8 @@ class Relief:
     """
 
     def __init__(self, context: ExportContext, folder: Path) -> None:
-        config, self.folder, self.T_file_map = (
-            context.placed.tiles.config,
-            folder,
-            context.T_survey_map,
-        )
+        self.folder, self.T_file_map = folder, context.T_survey_map
+        config = context.placed.tiles.config
         self.place = place_of(context, config.fusion.voxel_m)
         cameras = [drive.session.camera for drive in context.drives]
         far_m = max(fusion_range_m(camera, config.fusion) for camera in cameras)
@@ -259,7 +255,7 @@ class Canvas:
         cell, row, column = (i[row], j[column]), row + top, column + left
         xyz = np.column_stack([self._x_m[column], self._y_m[row], relief.height_m[sight.at][cell]])
         u, v, _ = project(apply(invert(relief.T_file_map @ view.T_map_camera), xyz), view.camera)
-        rgb = _sampled(image, u, v) * gain
+        rgb = sampled(image, u, v) * gain
         old, new = self._weight[row, column], weight[cell]
         share = new**_SHARPNESS / (new**_SHARPNESS + old.astype(np.float64) ** _SHARPNESS)
         share = np.where(piece[cell] > 0, new > old, share)[:, None]  # in one piece, no blend
@@ -271,18 +267,10 @@ class Canvas:
 def _compared(image: UInt8, sight: Sight, fused: Float32, good: Bool) -> tuple[Float64, Float32]:
     """Return what makes an image as bright as the fused points (3,), and how it agrees (R, C)."""
     known, off = good & ~np.isnan(fused[..., 0]), np.zeros(good.shape, np.float32)
-    rgb, points = _sampled(image, sight.u[known], sight.v[known]), fused[known]
+    rgb, points = sampled(image, sight.u[known], sight.v[known]), fused[known]
     light = rgb.min(axis=1, initial=255) > _DARK
     gain = np.median(points[light] / rgb[light], axis=0) if light.any() else np.ones(3)
     off[known] = np.abs(gain * rgb - points).mean(axis=1)
     usual = 3 * max(float(np.median(off[known])), 1.0) if known.any() else 1.0
     around = cv2.blur(off, _AROUND) / np.maximum(cv2.blur(known.astype(np.float32), _AROUND), 1e-6)
     return gain, np.exp(-0.5 * (around / usual) ** 2)
-
-
-def _sampled(image: UInt8, u: Float64, v: Float64) -> Float32:
-    """Return float32 (N, 3), the colours of an image at columns and rows."""
-    where = np.zeros((2, -(-len(u) // _LONGEST), _LONGEST), np.float32)
-    where.reshape(2, -1)[:, : len(u)] = u, v
-    found = cv2.remap(image, where[0], where[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(found.reshape(-1, 3)[: len(u)], np.float32)

@@ -10,7 +10,7 @@ from recon.core.geometry.se3 import exp_so3, make_transform
 from recon.core.values import PointCloud, RectifiedCamera
 from recon.core.values.camera import unproject
 from recon.export import orthophoto as made
-from recon.export.mesh.texture import PosedImage
+from recon.export.mesh.views import PosedImage
 from recon.export.orthophoto import Canvas, Relief
 from recon.io.models.rasters import RasterPlace
 from recon.map.ground.surface import GroundSurface

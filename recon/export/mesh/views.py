@@ -74,13 +74,13 @@ class Sight:
     def look(self, xyz: Float32) -> tuple[Float32, Bool]:
         """Return float32 (N, 3), the colours there; and bool (N,), which places are seen."""
         u, v, depth, inside = self.project(xyz)
-        nearness = _at(self._nearness, u / _STEP, v / _STEP)
+        nearness = sampled(self._nearness, u / _STEP, v / _STEP)
         seen = (inside >= 0) & ((depth - self._edge_m) * nearness <= 1)
-        return _at(self.view.image, u, v), seen
+        return sampled(self.view.image, u, v), seen
 
 
-def _at(image: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> Float32:
-    """Return the values of an image at columns and rows (N,), interpolated."""
+def sampled(image: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> Float32:
+    """Return float32 (N, …), the values of an image at columns and rows (N,), interpolated."""
     width = 1 << 14  # OpenCV takes no longer rows
     where = np.zeros((2, (1 + len(u) // width) * width), np.float32)
     where[:, : len(u)] = u, v
