@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from typing_extensions import Self
 
-from recon.core.geometry.se3 import apply, invert
+from recon.core.geometry.se3 import apply
 from recon.core.kernels.voxels import pack_keys, unpack_keys
 from recon.core.machine import versions
 from recon.core.progress import tracked
@@ -81,7 +81,7 @@ def measure_accuracy(
 
     ``files`` are ``inputs`` and ``products``, by the names under which they are to be found.
     Spreads are of the standard deviation of a place of the cloud (all three coordinates together),
-    and of what rays show of the ground: what a pixel is wide there in the nearest frame, how many
+    and of what rays show of the ground: how wide a pixel is there in the best frame, how many
     frames saw it, and the fraction of what a keyframe saw that the next one saw, too.
 
     Returns:
@@ -165,8 +165,10 @@ def _seen_ground(context: ExportContext) -> dict[str, Float64]:
     before = dict.fromkeys(keyframes, np.zeros(len(keys), np.bool_))
     for number, look in tracked(looks.by_frame(keys), "frames", "ground"):
         hit, (drive, frame) = look > 0, looks.frames[number]
-        depth_m = apply(invert(looks.T_map_camera[number]), places_m[hit])[:, 2]
-        gsd_m[hit] = np.fmin(gsd_m[hit], depth_m / focal_px[drive])
+        off_m = looks.T_map_camera[number][:3, 3] - places_m[hit]
+        # Root of what a pixel covers of a level surface, as cells of the orthophoto are wide.
+        away_m, above_m = np.linalg.norm(off_m, axis=1), np.maximum(off_m[:, 2], 1e-6)
+        gsd_m[hit] = np.fmin(gsd_m[hit], np.sqrt(away_m**3 / above_m) / focal_px[drive])
         frames += hit
         if frame in keyframes[drive]:
             if before[drive].any():

@@ -305,8 +305,9 @@ def test_ground_and_rig_are_those_of_the_street(rows, placed, small_demo):
     assert drive["baseline_m"] == pytest.approx(camera.baseline_m)
     assert drive["frames"] == drive["frames_placed"] == summary_of(small_demo)["frames"]
     gsd, frames = found["spreads"]["gsd_m"], found["spreads"]["frames"]
-    # From just ahead of the car to as far as rays are kept.
-    assert 1.0 / camera.focal_px < gsd["p5"] <= gsd["median"] <= gsd["p95"] < 30 / camera.focal_px
+    # From just below the car to as far as rays are kept, 30 m, from 1.6 m above the ground.
+    farthest_m = np.sqrt(30.0**3 / 1.0) / camera.focal_px
+    assert 1.0 / camera.focal_px < gsd["p5"] <= gsd["median"] <= gsd["p95"] < farthest_m
     assert 1 <= frames["p5"] <= frames["median"] <= drive["frames"]
     assert 0.0 < found["spreads"]["keyframe_overlap"]["median"] <= 1.0
     assert found["spreads"]["sigma_m"]["median"] >= found["surveyed_m"] / 3
