@@ -142,7 +142,7 @@ class _Images:
             at = self._turns[number].place(drive.rig, at)
         camera, (u, v) = drive.session.camera, at[0]
         if not (0 <= u <= camera.width_px - 1 and 0 <= v <= camera.height_px - 1):
-            got, expected = f"{pixel[0]:g}, {pixel[1]:g}", f"in {image}, where it is rectified"
+            got, expected = f"{pixel[0]:g}, {pixel[1]:g}", f"within the rectified image {image}"
             raise EvaluationError("no such pixel", where=self._where, got=got, expected=expected)
         if (number, frame) not in self._matched:
             pair = next(drive.source.frames(frame))
@@ -151,15 +151,30 @@ class _Images:
         return sighted(drive.T_map_camera[frame], camera, seen, float(u), float(v))
 
     def _frame(self, image: str) -> tuple[int, int]:
-        """Return the number of a drive with an image of that name or number, and of its frame."""
-        for number, drive in enumerate(self._drives):
-            frame = drive.source.number_of(image)
-            if frame is not None and frame < len(drive.placed):
-                if drive.placed[frame]:
-                    return number, frame
-                what = "the image has no place in the map"
-                raise EvaluationError(what, where=self._where, got=image)
+        """Return which drive has an image of that name or number, and which frame it is there.
+
+        The folder before the name may be that of the drive, or its number in the map.
+        """
+        names = [(str(one.session.number), one.session.info.source) for one in self._drives]
+        asked = [Path(image).parent.name in known for known in names]
+        of = {
+            n: frame
+            for n, drive in enumerate(self._drives)
+            if (frame := drive.source.number_of(image)) is not None
+            and frame < len(drive.placed)
+            and (asked[n] or not any(asked))
+        }
+        if len(of) == 1:
+            [(number, frame)] = of.items()
+            if self._drives[number].placed[frame]:
+                return number, frame
+            what = "the image has no place in the map"
+            raise EvaluationError(what, where=self._where, got=image)
         what, expected = "no such image in the drive", "the name of a left image, or its number"
+        if of:
+            what = "several drives have this image"
+            each = (f"{names[n][0]}/{image} of {names[n][1]}" for n in of)
+            expected = f"the drive before it: {' or '.join(each)}"
         raise EvaluationError(what, where=self._where, got=image, expected=expected)
 
 

@@ -46,6 +46,7 @@ def write_accuracy_page(figures: AccuracyFigures, places: Float64, run: RunDirec
     of_drives = [
         (key.replace("_", " "), *(known("{:.7g}", one[key], str(one[key])) for one in drives))
         for key in drives[0]
+        if any(one[key] is not None for one in drives)
     ]
     sections = [
         Section("Errors", [_errors(name, found, key) for key, name in kinds.items()],

@@ -176,6 +176,14 @@ def test_a_system_that_there_is_not_is_refused(rows, placed):
     assert_refused(placed(rows, head="EPSG:2263")[0], "easting and northing in metres")  # feet
 
 
+def test_an_antenna_of_control_points_and_another_system_are_refused(rows, placed):
+    done, out = placed(rows, "--to", "dsm", "--antenna", "0,0,1")
+    assert_refused(done, "--antenna: control points have no antenna")
+    done, out = placed(rows, "--to", "dsm", "--crs", "EPSG:25833")
+    assert_refused(done, "another coordinate system")
+    assert not out.exists()
+
+
 def test_paths_are_not_bent_by_control_points(rows, small_demo, tmp_path):
     (tmp_path / "gcp.txt").write_text("\n".join([HEAD, *rows]))
     done = run("merge", small_demo, "--georeference", tmp_path / "gcp.txt", "--out", tmp_path / "o")
