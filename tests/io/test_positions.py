@@ -95,7 +95,7 @@ def test_control_points_of_one_system_are_not_said_to_be_of_another(tmp_path, cr
     path = tmp_path / "gcp.txt"
     path.write_text("EPSG:25832\n500000 5400000 100 10 10 left.png a\n")
     if refused:
-        with pytest.raises(ReconError, match="another coordinate system .got EPSG:25832, exp"):
+        with pytest.raises(ReconError, match=r"another coordinate system .got EPSG:25832, exp"):
             read_control(path, crs)
     else:
         found = read_control(path, crs)
