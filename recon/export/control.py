@@ -67,7 +67,9 @@ def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | Non
     used = np.isfinite(ours_m[:, 0]) & ~np.array([point.check for point in points])
     if used.sum() < _FEWEST:
         what, expected = "too few control points", f"{_FEWEST} with depth, besides check points"
-        raise EvaluationError(what, where=where, got=int(used.sum()), expected=expected)
+        flat = [point.name for point, xyz in zip(points, ours_m, strict=True) if np.isnan(xyz[0])]
+        hint = f"without depth where it is seen: {', '.join(flat[:5])}" if flat else ""
+        raise EvaluationError(what, where=where, got=int(used.sum()), expected=expected, hint=hint)
     check_inside(control.system, np.median(place_m[used], axis=0), where)
     spread = np.array([covariance for _, covariance in ours]) + SURVEYED_M**2 * np.eye(3)
     sigma_m = np.sqrt(np.linalg.eigvalsh(spread[used])[:, -1])

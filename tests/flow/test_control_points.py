@@ -156,6 +156,7 @@ def test_how_well_points_fix_the_rotation_is_stated_with_what_it_means_at_the_ed
     ("change", "said"),
     [
         (lambda rows: rows[:2], "too few control points"),
+        (lambda rows: ["1 2 3 1 1 0 sky"], "without depth where it is seen: sky"),
         (lambda rows: [rows[0].replace(" 0 p", " 99 p"), *rows[1:]], "no such image in the drive"),
         (lambda rows: [rows[0].replace(" 60 70 ", " 6000 70 "), *rows[1:]], "no such pixel"),
         (lambda rows: [rows[0] + " twice", *rows[1:]], "gcp_list.txt:2: not a control point"),
@@ -302,6 +303,8 @@ def test_positions_along_the_drive_are_no_check_and_the_report_says_so(small_dem
     assert found["errors"]["path"]["rmse_m"]["3d"] == pytest.approx(found["survey"]["misfit_rms_m"])
     page = (tmp_path / "out/accuracy.html").read_text()
     assert "Path, RMSE horizontal" in page
+    assert "a misfit, no check" in page
+    assert "Check points" not in page
     assert "http" not in page.replace("http-equiv", "")
 
 
