@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Final
 
 from recon.core.errors import EvaluationError
-from recon.core.text import with_unit
+from recon.core.text import counted, with_unit
 from recon.io.files import read_text, reading
 from recon.io.models.ply import read_ply
 from recon.map.sessions.measured import Survey
+from recon.map.store.map_file import file_of_map
 from recon.map.store.records import check_format, connect
 from recon.report.scene import Scene
 from recon.run.directory import RECORD, RECORD_BYTES, STARTED, state_folder
@@ -45,11 +46,12 @@ def run_view(
     """
     if survey is not None and survey.control is None:
         what, hint = "positions along a drive cannot be clicked", "give a list of control points"
-        raise EvaluationError(what, where=survey.positions, hint=hint)
+        got = counted(len(survey.found.times_s), "position")
+        raise EvaluationError(what, where=survey.positions, got=got, hint=hint)
     shown = [(map_of(run), run) for run in runs]
     for run, _ in shown:
         if not (state_folder(run) / STARTED).is_file():
-            path, _ = run / "map/map.recon", command_of_map(run)  # refuses what made no map
+            _, path = command_of_map(run), file_of_map(run)  # refuses what made no map
             with reading(path), closing(connect(path, read_only=True)) as database:
                 check_format(database, path)
     with closing(Viewer(port)) as viewer:

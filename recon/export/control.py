@@ -67,7 +67,9 @@ def locate(map_: Map, survey: Survey, images: Sequence[Path], threads: int | Non
     used = np.isfinite(ours_m[:, 0]) & ~np.array([point.check for point in points])
     if used.sum() < _FEWEST:
         what, expected = "too few control points", f"{_FEWEST} with depth, besides check points"
-        raise EvaluationError(what, where=where, got=int(used.sum()), expected=expected)
+        flat = [point.name for point, xyz in zip(points, ours_m, strict=True) if np.isnan(xyz[0])]
+        hint = f"without depth where it is seen: {', '.join(flat[:5])}" if flat else ""
+        raise EvaluationError(what, where=where, got=int(used.sum()), expected=expected, hint=hint)
     check_inside(control.system, np.median(place_m[used], axis=0), where)
     spread = np.array([covariance for _, covariance in ours]) + SURVEYED_M**2 * np.eye(3)
     sigma_m = np.sqrt(np.linalg.eigvalsh(spread[used])[:, -1])
@@ -142,7 +144,7 @@ class _Images:
             at = self._turns[number].place(drive.rig, at)
         camera, (u, v) = drive.session.camera, at[0]
         if not (0 <= u <= camera.width_px - 1 and 0 <= v <= camera.height_px - 1):
-            got, expected = f"{pixel[0]:g}, {pixel[1]:g}", f"in {image}, where it is rectified"
+            got, expected = f"{pixel[0]:g}, {pixel[1]:g}", f"within the rectified image {image}"
             raise EvaluationError("no such pixel", where=self._where, got=got, expected=expected)
         if (number, frame) not in self._matched:
             pair = next(drive.source.frames(frame))
@@ -151,15 +153,30 @@ class _Images:
         return sighted(drive.T_map_camera[frame], camera, seen, float(u), float(v))
 
     def _frame(self, image: str) -> tuple[int, int]:
-        """Return the number of a drive with an image of that name or number, and of its frame."""
-        for number, drive in enumerate(self._drives):
-            frame = drive.source.number_of(image)
-            if frame is not None and frame < len(drive.placed):
-                if drive.placed[frame]:
-                    return number, frame
-                what = "the image has no place in the map"
-                raise EvaluationError(what, where=self._where, got=image)
+        """Return which drive has an image of that name or number, and which frame it is there.
+
+        The folder before the name may be that of the drive, or its number in the map.
+        """
+        names = [(str(one.session.number), one.session.info.source) for one in self._drives]
+        asked = [Path(image).parent.name in known for known in names]
+        of = {
+            n: frame
+            for n, drive in enumerate(self._drives)
+            if (frame := drive.source.number_of(image)) is not None
+            and frame < len(drive.placed)
+            and (asked[n] or not any(asked))
+        }
+        if len(of) == 1:
+            [(number, frame)] = of.items()
+            if self._drives[number].placed[frame]:
+                return number, frame
+            what = "the image has no place in the map"
+            raise EvaluationError(what, where=self._where, got=image)
         what, expected = "no such image in the drive", "the name of a left image, or its number"
+        if of:
+            what = "several drives have this image"
+            each = (f"{names[n][0]}/{image} of {names[n][1]}" for n in of)
+            expected = f"the drive before it: {' or '.join(each)}"
         raise EvaluationError(what, where=self._where, got=image, expected=expected)
 
 

@@ -310,6 +310,7 @@ def _degrees(text: str, side: str, path: Path) -> float:
 _UTM: Final = re.compile(r"WGS84 UTM (0?[1-9]|[1-5]\d|60)([NS])$", re.IGNORECASE)
 _SYSTEM: Final = re.compile(r"(EPSG:\d+|\+proj|WGS84 UTM )", re.IGNORECASE)
 _CHECK: Final = "check"
+_SAME_SYSTEM_M: Final = 10.0  # datums of today differ by metres, zones and older datums by more
 
 
 @dataclass(frozen=True, eq=False)
@@ -433,8 +434,15 @@ def _in_metres(
     except pyproj.exceptions.CRSError as error:
         raise FormatError("unknown coordinate system", where=path, got=system) from error
     if not geographic:
-        check_crs(system, path)
+        stated = check_crs(system, path)
         if not degrees:
+            if crs is not None:
+                there = pyproj.Transformer.from_crs(stated, check_crs(crs), always_xy=True)
+                moved_m = np.array(there.transform(*places[:, :2].T)).T - places[:, :2]
+                # Names of one system, perhaps with heights; also of datums that are nearly one.
+                if not np.linalg.norm(moved_m, axis=1).max() < _SAME_SYSTEM_M:
+                    what, hint = "the list has another coordinate system", "drop --crs"
+                    raise FormatError(what, where=path, got=system, expected=crs, hint=hint)
             return places, crs or system
         crs = crs or system
     found = Positions(np.zeros(len(places)), places[:, [1, 0, 2]], np.zeros((0, 3)), degrees=True)

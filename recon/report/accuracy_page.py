@@ -46,11 +46,13 @@ def write_accuracy_page(figures: AccuracyFigures, places: Float64, run: RunDirec
     of_drives = [
         (key.replace("_", " "), *(known("{:.7g}", one[key], str(one[key])) for one in drives))
         for key in drives[0]
+        if any(one[key] is not None for one in drives)
     ]
     sections = [
         Section("Errors", [_errors(name, found, key) for key, name in kinds.items()],
-                f"Map minus survey, in metres; σ is what was expected. Points are taken as "
-                f"surveyed to {figures.surveyed_m:g} m. Check points place nothing."),
+                "Map minus survey, in metres. " + ("The positions place it: a misfit, no check."
+                if "path" in figures.errors else "σ is what was expected, of points surveyed to "
+                f"{figures.surveyed_m:g} m. Check points place nothing.")),
         Section("Map and images", [
             Image("Standard deviation of places", _sigma_map(places),
                   "Seen from above: of all three coordinates together, by the points and by how "

@@ -171,6 +171,8 @@ class RunDirectory:
         files = [Path(name) for name in self.files()]
         for stale in set(self._earlier) - set(files):
             (self.folder / stale).unlink(missing_ok=True)
+            with suppress(OSError):  # there are others in it
+                os.removedirs((self.folder / stale).parent)
         # The record goes last: a folder with a new run.json has every file it lists.
         for file in sorted(files, key=lambda f: f.name == RECORD):
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)

@@ -114,8 +114,11 @@ class Viewer:
             self._places = []
         if "ray" in wanted:
             self._click(*wanted["ray"])
-        if "point" in wanted and self._point.value in self._control:
-            self._choose(None, self._control[self._point.value])
+        if "point" in wanted:
+            self._residual.content = ""
+            if (name := self._point.value) in self._control:
+                self._residual.content = _html([f"Click {name} in the image."])
+                self._choose(None, self._control[name])
         if "keyframe" in wanted and self._keyframes:
             self._choose(wanted["keyframe"], None)
         if wanted:

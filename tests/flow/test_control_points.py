@@ -156,6 +156,7 @@ def test_how_well_points_fix_the_rotation_is_stated_with_what_it_means_at_the_ed
     ("change", "said"),
     [
         (lambda rows: rows[:2], "too few control points"),
+        (lambda rows: ["1 2 3 1 1 0 sky"], "without depth where it is seen: sky"),
         (lambda rows: [rows[0].replace(" 0 p", " 99 p"), *rows[1:]], "no such image in the drive"),
         (lambda rows: [rows[0].replace(" 60 70 ", " 6000 70 "), *rows[1:]], "no such pixel"),
         (lambda rows: [rows[0] + " twice", *rows[1:]], "gcp_list.txt:2: not a control point"),
@@ -174,6 +175,14 @@ def test_what_cannot_be_used_is_one_line_and_leaves_nothing(rows, placed, change
 def test_a_system_that_there_is_not_is_refused(rows, placed):
     assert_refused(placed(rows, head="EPSG:99999")[0], "unknown coordinate system")
     assert_refused(placed(rows, head="EPSG:2263")[0], "easting and northing in metres")  # feet
+
+
+def test_an_antenna_of_control_points_and_another_system_are_refused(rows, placed):
+    done, out = placed(rows, "--to", "dsm", "--antenna", "0,0,1")
+    assert_refused(done, "--antenna: control points have no antenna")
+    done, out = placed(rows, "--to", "dsm", "--crs", "EPSG:25833")
+    assert_refused(done, "another coordinate system")
+    assert not out.exists()
 
 
 def test_paths_are_not_bent_by_control_points(rows, small_demo, tmp_path):
@@ -294,6 +303,8 @@ def test_positions_along_the_drive_are_no_check_and_the_report_says_so(small_dem
     assert found["errors"]["path"]["rmse_m"]["3d"] == pytest.approx(found["survey"]["misfit_rms_m"])
     page = (tmp_path / "out/accuracy.html").read_text()
     assert "Path, RMSE horizontal" in page
+    assert "a misfit, no check" in page
+    assert "Check points" not in page
     assert "http" not in page.replace("http-equiv", "")
 
 

@@ -208,6 +208,8 @@ def test_what_shows_no_map_is_refused_in_one_line(small_demo, tmp_path, monkeypa
     assert_refused(run("view", damaged, "--port", "0"), "damaged")
     (damaged / "map/map.recon").write_bytes(b"no database")
     assert_refused(run("view", damaged, "--port", "0"), "map.recon")
+    (damaged / "map/map.recon").unlink()
+    assert_refused(run("view", damaged, "--port", "0"), "folder has no map")
 
 
 def test_a_taken_port_and_a_missing_package_are_refused_in_one_line(small_demo, monkeypatch):

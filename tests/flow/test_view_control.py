@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.commands import view
-from recon.core.errors import EvaluationError
+from recon.core.errors import EvaluationError, ReconError
 from recon.core.geometry.se3 import apply, invert
 from recon.core.values.camera import project
 from recon.map.sessions.measured import Survey
@@ -110,4 +110,7 @@ def test_positions_of_a_drive_are_refused(small_demo, tmp_path):
     file = tmp_path / "positions.txt"
     file.write_text("0 1 2 3\n1 2 3 4\n")
     with pytest.raises(EvaluationError, match="cannot be clicked"):
+        view.run_view([small_demo], 0, print, lambda: True, Survey(file))
+    file.unlink()
+    with pytest.raises(ReconError, match="does not exist"):
         view.run_view([small_demo], 0, print, lambda: True, Survey(file))

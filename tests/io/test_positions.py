@@ -80,6 +80,28 @@ def test_a_system_of_control_points_that_there_is_not_is_refused_by_their_file(t
         read_control(path)
 
 
+@pytest.mark.parametrize(
+    ("crs", "refused"),
+    [
+        ("EPSG:25832", False),
+        ("EPSG:25832+7837", False),  # with heights
+        ("EPSG:32632", False),
+        ("+proj=utm +zone=32 +ellps=GRS80", False),
+        ("EPSG:25833", True),
+        ("EPSG:31467", True),
+    ],
+)
+def test_control_points_of_one_system_are_not_said_to_be_of_another(tmp_path, crs, refused):
+    path = tmp_path / "gcp.txt"
+    path.write_text("EPSG:25832\n500000 5400000 100 10 10 left.png a\n")
+    if refused:
+        with pytest.raises(ReconError, match=r"another coordinate system .got EPSG:25832, exp"):
+            read_control(path, crs)
+    else:
+        found = read_control(path, crs)
+        assert (found.system, *found.points[0].place_m) == (crs, 500000, 5400000, 100)
+
+
 def test_nmea_over_midnight_and_damaged_sentences(tmp_path, degrees):
     times_s = receivers.DAY_S - 1.0 + 0.1 * np.arange(30)
     path = receivers.write_nmea(tmp_path / "gnss", times_s, degrees)

@@ -234,6 +234,7 @@ def test_a_second_run_replaces_the_first_and_keeps_what_is_not_a_runs(tmp_path, 
     killed.write_text("half")
     write_run(tmp_path / "run", "map/cloud.ply", whole=whole)
     assert files_in(tmp_path / "run") == {"map/cloud.ply", "notes.txt", "run.json"}
+    assert not (tmp_path / "run/mesh").exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["precious", "run"]
 
 

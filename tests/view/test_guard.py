@@ -254,11 +254,13 @@ def test_a_click_at_the_image_of_a_keyframe_is_one_at_the_chosen_control_point(s
         page.send(msgspec.msgpack.encode(choice(served, "Control point", "p1")))
         assert until(lambda: node(viewer, "/control/image"))
         assert "The place at 0.5, 0.5, 0.5 m was seen by 2 keyframes: 0, 1" in viewer._said.content
+        assert "Click p1 in the image" in viewer._residual.content
         page.send(msgspec.msgpack.encode(CLICK))
         assert until(lambda: "p1, map minus survey:" in viewer._residual.content)
         assert views.marked == ("p1", 0, [CLICK["ray_origin"], CLICK["ray_direction"]])
         page.send(msgspec.msgpack.encode(choice(served, "Control point", "none")))
         assert until(lambda: node(viewer, "/control/image") is None)
+        assert not viewer._residual.content
 
 
 def node(viewer: Viewer, name: str) -> object:

@@ -134,9 +134,9 @@ def check_inside(crs: str, position_m: Float64, where: StrPath) -> None:
     ):
         return
     what = "the positions lie outside the area of their coordinate system"
-    got = f"easting {position_m[0]:.0f}, northing {position_m[1]:.0f} in {crs}"
+    got = f"easting {position_m[0]:.9g}, northing {position_m[1]:.9g} in {crs}"
     lon_lat = f"longitude {area.west:g} to {area.east:g}, latitude {area.south:g} to {area.north:g}"
-    hint = "columns are time, easting, northing, height in metres; without --crs any are taken"
+    hint = "are they easting, then northing, in metres of this system?"
     raise EvaluationError(what, where=where, got=got, expected=lon_lat, hint=hint)
 
 

@@ -93,7 +93,11 @@ class Survey:
     @cached_property
     def control(self) -> ControlPoints | None:
         """The control points of the file; None = it has positions of a drive."""
-        return read_control(self.positions, self.crs) if is_control(self.positions) else None
+        if not is_control(self.positions):
+            return None
+        if any(self.antenna_m):
+            raise SettingsError("control points have no antenna", where="--antenna")
+        return read_control(self.positions, self.crs)
 
     @cached_property
     def found(self) -> Positions:
