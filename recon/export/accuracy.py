@@ -28,7 +28,7 @@ from recon.io.files import digest_of
 from recon.map.sessions.georeference import Georeference, SurveyFigures
 from recon.map.store.session import Session
 
-_ENOUGH: Final = 30  # check points for a statement by ASPRS
+ENOUGH: Final = 30  # check points for a statement by ASPRS
 _MOST_VOXELS: Final = 20_000  # of the ground, all over the map, that frames are asked for
 _OFF = attrgetter("east_m", "north_m", "up_m")
 Spread = Mapping[str, float]  # ``median``, ``p5`` and ``p95``, percentiles
@@ -123,8 +123,8 @@ def _statement(tested: ErrorFigures | None) -> str:
     if tested is None:
         return "No check points: nothing independent says how accurate the map is."
     points = counted(tested.points, "check point")
-    if tested.points < _ENOUGH:
-        return f"{points}: too few for a statement by ASPRS ({_ENOUGH})."
+    if tested.points < ENOUGH:
+        return f"{points}: too few for a statement by ASPRS ({ENOUGH})."
     flat, up = metres(tested.rmse_m["horizontal"]), metres(tested.rmse_m["up"])
     return f"Tested by {points} (ASPRS, edition 2, 2023): RMSE_H {flat}, RMSE_V {up}."
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from recon.core.text import counted, metres
 from recon.core.values.arrays import Float64
-from recon.export.accuracy import AccuracyFigures
+from recon.export.accuracy import ENOUGH, AccuracyFigures
 from recon.report import style
 from recon.report.page import write_page
 from recon.report.sections import Image, Page, Section, Table, known, row_of
@@ -70,7 +70,10 @@ def write_accuracy_page(figures: AccuracyFigures, places: Float64, run: RunDirec
     )
     where = f"{figures.system or 'unknown coordinate system'}, placed by {by}"
     subtitle = f"{where}. {figures.statement} {figures.made_utc}"
-    page = Page("Accuracy", subtitle, shown, sections, {}, figures.warnings)
+    tested = figures.errors.get("tested")
+    few = tested is None or tested.points < ENOUGH
+    doubts = [*([figures.statement] if few else []), *figures.warnings]
+    page = Page("Accuracy", subtitle, shown, sections, {}, doubts)
     write_page(page, run, "accuracy.html")
 
 

@@ -303,6 +303,7 @@ def test_positions_along_the_drive_are_no_check_and_the_report_says_so(small_dem
     assert found["errors"]["path"]["rmse_m"]["3d"] == pytest.approx(found["survey"]["misfit_rms_m"])
     page = (tmp_path / "out/accuracy.html").read_text()
     assert "Path, RMSE horizontal" in page
+    assert "No warnings" not in page  # nothing has checked the map
     assert "a misfit, no check" in page
     assert "Check points" not in page
     assert "http" not in page.replace("http-equiv", "")
