@@ -18,6 +18,7 @@ from recon.commands.pair import match as match
 from recon.commands.pair import reconstruct as reconstruct
 from recon.commands.pair import run_disparity as run_disparity
 from recon.commands.pair import run_pair as run_pair
+from recon.commands.volume import run_volume as run_volume
 from recon.core.errors import ReconError as ReconError
 from recon.core.progress import Progress as Progress
 from recon.core.progress import showing as showing
