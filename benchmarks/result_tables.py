@@ -215,6 +215,15 @@ TABLES: Final[dict[str, Table]] = {
         lambda found: found,
         timed=True,
     ),
+    "orthophoto": Table(
+        {
+            "orthophoto": "python benchmarks/orthophoto.py "
+            "--drive $RECON_DATA/driven/kitti_raw_0013 --json"
+        },
+        {"cell": "{:.3f} m", "patches": "{}", "median": "{:.3f} m", "95 %": "{:.3f} m"}
+        | {"median in cells": "{:.2f}", "95 % in cells": "{:.2f}"},
+        lambda found: found["orthophoto"],
+    ),
     "survey": Table(
         {
             "kitti_raw_0013": "python benchmarks/survey.py $RECON_DATA/driven/kitti_raw_0013 "
