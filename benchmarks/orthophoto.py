@@ -84,8 +84,9 @@ def of_drive(drive: Path, folder: Path) -> dict[str, dict[str, Any]]:
     np.savetxt(positions, np.column_stack([times_s, places, np.full(len(places), STATED_M)]))
     survey = Survey(positions)
     run_merge([run], options=MapOptions("merge", held, mesh=False), survey=survey)
-    told = run_export(run, products=("orthophoto",), out=folder / "mapped").to_json()
-    run_export(held, products=("orthophoto",), out=folder / "surveyed", survey=survey)
+    how = {"products": ("orthophoto",), "images": (drive,)}
+    told = run_export(run, out=folder / "mapped", **how).to_json()
+    run_export(held, out=folder / "surveyed", survey=survey, **how)
     ways = {"as mapped": np.array(told["T_map_world"]), "held at positions": T_up_world}
     pictures = (folder / name / "map/orthophoto.tif" for name in ("mapped", "surveyed"))
     return {
