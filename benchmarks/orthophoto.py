@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +33,7 @@ from recon.commands.map_options import MapOptions
 from recon.commands.merge import run_merge
 from recon.core.geometry.se3 import apply, invert, make_transform
 from recon.core.values.arrays import Float64
+from recon.io.images.image import read_image
 from recon.io.models.ply import read_ply
 from recon.io.trajectory import read_kitti_poses, read_tum
 from recon.map.ground.axes import AXES_MAP_WORLD
@@ -84,9 +86,9 @@ def of_drive(drive: Path, folder: Path) -> dict[str, dict[str, Any]]:
     np.savetxt(positions, np.column_stack([times_s, places, np.full(len(places), STATED_M)]))
     survey = Survey(positions)
     run_merge([run], options=MapOptions("merge", held, mesh=False), survey=survey)
-    how = {"products": ("orthophoto",), "images": (drive,)}
-    told = run_export(run, out=folder / "mapped", **how).to_json()
-    run_export(held, out=folder / "surveyed", survey=survey, **how)
+    photo = partial(run_export, products=("orthophoto",), images=(drive,))
+    told = photo(run, out=folder / "mapped").to_json()
+    photo(held, out=folder / "surveyed", survey=survey)
     ways = {"as mapped": np.array(told["T_map_world"]), "held at positions": T_up_world}
     pictures = (folder / name / "map/orthophoto.tif" for name in ("mapped", "surveyed"))
     return {
@@ -116,7 +118,7 @@ def against_drive(drive: Path, T_file_world: Float64, picture: Path) -> dict[str
         width = int(2 * NEAR_M / cell_m)
         at = np.s_[top : top + width, left : left + width]
         right, down, ahead = np.moveaxis((xyz[at] - T[:3, 3]) @ T[:3, :3], -1, 0)
-        image = cv2.imread(str(drive / f"image_0/{number:010d}.png"), cv2.IMREAD_GRAYSCALE)
+        image = read_image(drive / f"image_0/{number:010d}.png")
         with np.errstate(all="ignore"):
             u, v = focal * right / ahead + cx, focal * down / ahead + cy
         inside = (
@@ -124,8 +126,8 @@ def against_drive(drive: Path, T_file_world: Float64, picture: Path) -> dict[str
         )
         score = np.where(inside, 1 / np.maximum(ahead, 1), 0)
         better = score > nearest[at]
-        where = (np.nan_to_num(one).astype(np.float32) for one in (u, v))
-        true[at][better] = cv2.remap(image, *where, cv2.INTER_LINEAR)[better]
+        where = np.nan_to_num([u, v]).astype(np.float32)
+        true[at][better] = cv2.remap(image, where[0], where[1], cv2.INTER_LINEAR)[better]
         nearest[at][better] = score[better]
     return shifts(ours[:3].mean(axis=0), true, (ours[3] > 0) & (nearest > 0), cell_m)
 
@@ -140,11 +142,12 @@ def _ground(points: Float64, eyes: Float64, x: Float64, y: Float64) -> Float64:
     west, north = x.min(), y.max()
     middles = np.stack([west + right.ravel() * SQUARE_M, north - down.ravel() * SQUARE_M], axis=1)
     near = cKDTree(ground[:, :2]).query_ball_point(middles, SQUARE_M)
-    heights = [np.median(ground[own, 2]) if len(own) > 3 else np.nan for own in near]
-    heights = np.array(heights, np.float32).reshape(shape)
+    medians = [np.median(ground[own, 2]) if len(own) > 3 else np.nan for own in near]
+    heights = np.array(medians, np.float32).reshape(shape)
     where = (((x - west) / SQUARE_M), ((north - y) / SQUARE_M))
     column, row = (one.astype(np.float32) for one in where)
-    return cv2.remap(heights, column, row, cv2.INTER_LINEAR, borderValue=np.nan)
+    found = cv2.remap(heights, column, row, cv2.INTER_LINEAR, borderValue=np.nan)
+    return np.asarray(found, np.float64)
 
 
 def against_street(run: Path, picture: Path) -> dict[str, Any]:
