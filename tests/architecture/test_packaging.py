@@ -124,7 +124,7 @@ def test_version_is_the_same_everywhere(root, pyproject):
 def test_what_messages_and_pages_tell_to_install_is_this_package(root, pyproject):
     """And not the project of biology that is called as what is imported."""
     assert pyproject["project"]["name"] == DISTRIBUTION != "recon"
-    pages = [root / "README.md", *(root / "docs").glob("*.md"), *(root / "scripts").iterdir()]
+    pages = [root / "README.md", *(root / "docs").glob("*.md"), *(root / "scripts").glob("*.*")]
     files = [*pages, *(root / "recon").rglob("*.py")]
     wrong = re.compile(r"(?<![\w-])recon\\?\[(?:cluster|onnx|ros|sfm|survey|view|dev|NAME)\\?\]")
     assert [path.name for path in files if wrong.search(path.read_text())] == []
