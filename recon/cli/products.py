@@ -231,7 +231,5 @@ def volume(
         from recon.commands.volume import run_volume
 
         ends = None if within is None else opt.parse_numbers(within, "--within")
-        summary = run_volume(
-            run, other, height_m=height, within_m=ends, threads=shared.threads or 1
-        )
+        summary = run_volume(run, other, height_m=height, within_m=ends, threads=shared.threads)
     shared.show(summary)

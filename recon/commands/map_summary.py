@@ -251,9 +251,8 @@ class ExportSummary(RunSummary):
         most = _MOST_ROWS if self.survey is None else _MOST_ROWS - 1
         shown, others = (made, []) if len(made) <= most else (made[: most - 1], made[most - 1 :])
         rest = shorten(", ".join(name for name, *_ in others), 60, placeholder=" …")
-        place = (
-            [] if self.survey is None else [("survey", "accuracy.html", self._placed(self.survey))]
-        )
+        survey = self.survey
+        place = [] if survey is None else [("survey", "accuracy.html", self._placed(survey))]
         return [
             (f"{counted(len(made), 'product')} of {self.run}",),
             *self.folder_row(),

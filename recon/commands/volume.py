@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from recon.core.errors import SettingsError
+from recon.core.machine import available_cores
 from recon.core.summary import Rows, Summary, inline
 from recon.core.values import PointCloud, join_clouds
 from recon.export.volume import VolumeFigures, volume_between
@@ -43,7 +44,7 @@ def run_volume(
     *,
     height_m: float | None = None,
     within_m: Sequence[float] | None = None,
-    threads: int = 1,
+    threads: int | None = None,
 ) -> VolumeSummary:
     """Return how much was dug and heaped up: what `recon volume` does.
 
@@ -52,7 +53,7 @@ def run_volume(
         other: That of a later one through the same place, linked as by `run_diff`; or
         height_m: the height of a level plane below the run.
         within_m: Smallest x and y, largest x and y; None = everywhere.
-        threads: Threads to use.
+        threads: Threads to use; None = all cores.
 
     Raises:
         ReconError: Not one of a run and a height is given, the rectangle is none, a map is damaged,
@@ -70,14 +71,15 @@ def run_volume(
             raise SettingsError(what, where="--within", got=within_m, expected=expected)
         within = Rectangle((within_m[0], within_m[1]), (within_m[2], within_m[3]))
     before: PointCloud | float
+    cores = threads or available_cores()
     with Map.open(run) as first:
         settings = settings_of(first.first)
         if other is None:
-            tiles = place_map(first, settings, threads).tiles
+            tiles = place_map(first, settings, cores).tiles
             before, after = float(height_m or 0.0), join_clouds(tile.cloud for tile in tiles)
         else:
             with Map.open(other) as second, Map.temporary() as both:
-                found = compare(both, gather(both, first, second), threads)
+                found = compare(both, gather(both, first, second), cores)
             before, after = found.before.cloud, found.after.cloud
     cell_m = settings.occupancy.resolution_m
     return VolumeSummary(

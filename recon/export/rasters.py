@@ -86,10 +86,8 @@ def columns_of(
     row, column = place.cells_of(xyz[:, :2])
     at = np.s_[row.min() : row.max() + 1, column.min() : column.max() + 1]
     shape = int(np.ptp(row)) + 1, int(np.ptp(column)) + 1
-    cell, top = (
-        np.ravel_multi_index((row - row.min(), column - column.min()), shape),
-        np.full(shape, -np.inf),
-    )
+    cell = np.ravel_multi_index((row - row.min(), column - column.min()), shape)
+    top = np.full(shape, -np.inf)
     np.maximum.at(top.ravel(), cell, xyz[:, 2])
     counted = weight * (xyz[:, 2] >= top.ravel()[cell] - place.cell_m)
 
