@@ -164,10 +164,10 @@ def write_drive(week: int, folder: Path) -> Path:
     if folder.exists():
         return folder
     drive, part = WeekDrive(week), folder.with_suffix(".part")
-    for side in ("image_2", "image_3"):
+    for side in ("image_0", "image_1"):
         (part / side).mkdir(parents=True, exist_ok=True)
     for pair in islice(drive.frames(), FRAMES):
-        for side, image in (("image_2", pair.left), ("image_3", pair.right)):
+        for side, image in (("image_0", pair.left), ("image_1", pair.right)):
             write_image(part / side / f"{pair.index:06d}.png", image)
     write_calibration(drive.calibration, part / "calib.txt")
     path = drive.trajectory.select(np.arange(FRAMES))
