@@ -2,9 +2,10 @@
 
 The drives are rendered (`tests/scenery/year.py`), 20 frames each: cars, a hoarding, a tree, leaves,
 sun and rain. Each goes into one map as `recon map DRIVE --into RUN` puts it there. Beside it a map
-that keeps all drives, and the newest drive alone. Before some weeks go in, their drive is looked
-for in the maps of the weeks before. A frame is found if the map gives its pose and it is within
-3 cm of the truth; the truth is fitted to the paths that the map has, not to what is found.
+that keeps all drives, and the newest drive alone. Products of the one that keeps all are made in
+the first weeks only: later they take longer than all the rest. Before some weeks go in, their drive
+is looked for in the maps of the weeks before. A frame is found if the map gives its pose and it is
+within 3 cm of the truth; the truth is fitted to the paths that the map has, not to what is found.
 
 Drives, runs and curves stay in --folder; drives that are there already are not rendered again.
 
@@ -23,7 +24,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -53,6 +56,7 @@ NEAR_M: Final = 0.03
 FRAMES: Final = 20  # of each drive
 LOOKED: Final = (1, 13, 26, 39, 51)
 """Weeks, from 0, whose drive is looked for in the weeks before, and at which maps are compared."""
+PRODUCED: Final = 2  # of these maps, products are made of the first ones that keep all drives
 KEPT: Final = {"looked after": "into", "all kept": "all", "newest only": "newest"}
 JOINING: Final = ("links", "forget", "map", "cloud", "octomap", "grid")
 """What takes longer in a larger map, by its names in the summary."""
@@ -65,9 +69,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         folder = Path(name) if options.folder is None else options.folder
         begun = time.perf_counter()
         year = Year(folder, [name for name in KEPT if name != "all kept" or not options.quick])
-        for week in track(range(options.weeks), "weeks", disable=options.json):
-            year.add(week)
-            (folder / "year.json").write_text(json.dumps(year.rows, indent=2))
+        with ProcessPoolExecutor(1) as renderer:
+            # That of the next week is rendered beside each week's mapping.
+            drives = deque([renderer.submit(write_drive, 0, year.drive_of(0))])
+            for week in track(range(options.weeks), "weeks", disable=options.json):
+                if week + 1 < options.weeks:
+                    drives.append(renderer.submit(write_drive, week + 1, year.drive_of(week + 1)))
+                year.add(week, drives.popleft().result())
+                (folder / "year.json").write_text(json.dumps(year.rows, indent=2))
         found = {"maps": year.rows, "minutes": (time.perf_counter() - begun) / 60.0}
         (folder / "year.png").write_bytes(curves(year.rows))
     if options.json:
@@ -97,9 +106,11 @@ class Year:
             file.parent.mkdir(parents=True) if "into" not in file.parts else None
         self.rows: dict[str, dict[int, dict[str, float]]] = {name: {} for name in names}
 
-    def add(self, week: int) -> None:
+    def drive_of(self, week: int) -> Path:
+        return self.folder / "drives" / f"{week:02d}"
+
+    def add(self, week: int, drive: Path) -> None:
         """Look for the drive of a week in the maps so far, then put it into them."""
-        drive = write_drive(week, self.folder / "drives" / f"{week:02d}")
         for name in self.rows if week in LOOKED else ():
             self._row(name, week - 1).update(self._found(drive, self.files[name], name))
         into = self.folder / KEPT["looked after"]
@@ -121,19 +132,19 @@ class Year:
         return self.rows[name].setdefault(week, {})
 
     def _keep_all(self, newest: Map, before: list[int], mapped_s: float, week: int) -> None:
-        """Merge a drive; its products are made where maps are compared, as they take long."""
+        """Merge a drive; its products are made where maps are compared, and do not take long."""
         file, row, begun = self.files["all kept"], self._row("all kept", week), time.process_time()
         with Map.open(file, read_only=False) if week else Map.create(file) as map_:
             join_new(map_, copy_sessions(newest, map_, before))
             map_.commit()
-            row["megabytes"] = size(file)
-            if week + 1 in LOOKED or week + 1 == WEEKS:
+            if week + 1 in LOOKED[:PRODUCED]:
                 config = run_settings(self.folder / KEPT["looked after"])
                 placed = place_map(map_, config, 2)
                 out = self.folder / "products"
                 out.mkdir(exist_ok=True)
                 make(ExportContext(map_, placed, config.mesh, threads=2), out, PRODUCTS)
                 row["seconds"] = mapped_s + time.process_time() - begun
+        row["megabytes"] = size(file)  # of a closed one, whose changes are all in it
 
     def _found(self, drive: Path, map_: Path, name: str) -> dict[str, float]:
         """Look for a drive in a map; what part of its frames is found, and how precisely."""

@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 
+from recon.sources.registry import open_source
 from tests.flow.runs import RECON, ROOT
 from tests.scenery.kitti import street_drive
+from tests.scenery.year import FIRST_S, WEEK_S, WeekDrive
 
 BENCHMARKS = ROOT / "benchmarks"
 LIMIT_MB = 750
@@ -75,3 +77,16 @@ def test_a_drive_twice_as_long_takes_hardly_more_memory():
     for name, most in (("mesh", 1.25), ("occupancy", 1.1)):
         peaks_mb = [row["again"][name]["peak_mb"] for row in (long, short)]
         assert peaks_mb[0] / peaks_mb[1] < most
+
+
+def test_a_week_of_the_year_is_a_drive_that_maps_read(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    year = runpy.run_path(str(BENCHMARKS / "year.py"))
+    monkeypatch.setitem(year["write_drive"].__globals__, "FRAMES", 2)
+    source = open_source(year["write_drive"](3, tmp_path / "03"))
+    first, second = source.frames()
+    assert first.timestamp_s == FIRST_S + 3 * WEEK_S
+    assert first.left.shape == second.right.shape == (208, 512, 3)
+    rendered = WeekDrive(3).calibration
+    assert source.calibration.baseline_m == pytest.approx(rendered.baseline_m)
+    assert source.calibration.focal_px == pytest.approx(rendered.focal_px)
