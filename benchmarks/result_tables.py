@@ -332,7 +332,7 @@ TABLES: Final[dict[str, Table]] = {
         rows_of.recordings,
     ),
     "year": Table(
-        {"year": "python benchmarks/year.py --quick --weeks 27 --json"},
+        {"year": "python benchmarks/year.py --json"},
         {"weeks": "{}", "map after the first": "{:.1f} MB", "after the last": "{:.1f} MB"}
         | {"second added in": "{:.0f} s", "last in": "{:.0f} s"}
         | {"last found at 3 cm": "{:.0f} %", "off": CM},

@@ -32,10 +32,10 @@ def write_accuracy_page(figures: AccuracyFigures, places: Float64, run: RunDirec
     found = figures.to_json()
     kinds = {"check": "Check points", "control": "Control points", "path": "Path"}
     shown = [
-        (f"{name}, RMSE {axis}", metres(figures.errors[key].rmse_m[axis]))
+        (f"{name}, RMSE {title}", metres(figures.errors[key].rmse_m[axis]))
         for key, name in kinds.items()
         if key in figures.errors
-        for axis in ("horizontal", "up", "3d")
+        for axis, title in {"horizontal": "horizontal", "up": "of height", "3d": "in 3-D"}.items()
     ]
     spreads = [
         row_of(name, found["spreads"][key], [(form, of) for of in ("median", "p5", "p95")])

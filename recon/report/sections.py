@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Literal
@@ -198,7 +199,10 @@ def at(found: Any, *keys: str) -> Any:
 
 def known(form: str, value: Any, otherwise: str = "") -> str:
     """Return a number in a form, such as ``{:.1f} s``; something else if it is not known."""
-    return form.format(value) if is_number(value) else otherwise
+    if not is_number(value):
+        return otherwise
+    text = form.format(value)
+    return text if re.search("[1-9]", text) else text.removeprefix("-")  # 0 is no direction
 
 
 def row_of(name: str, found: Any, columns: Iterable[tuple[str, ...]]) -> Row:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from recon.report import style
 from recon.report.batch_page import batch_tables, sweep_figure, write_batch_page
 from recon.report.middlebury_page import csv_table, middlebury_tables
-from recon.report.sections import Table, join
+from recon.report.sections import Table, join, known
 from recon.run.batch.job import Outcome
 from recon.run.batch.results import JobResult, compare
 from recon.run.directory import RunDirectory
@@ -83,6 +83,16 @@ def test_what_is_not_known_is_a_dash_and_means_over_some_scenes_say_so():
     found = tables(given)
     assert "Weighted mean of 1 of 2 scenes, nonocc, dense" in found
     assert found["seconds of each scene, matching alone"][2].split() == ["Teddy", "0.500", "–"]
+
+
+def test_what_rounds_to_nothing_has_no_sign():
+    assert [known("{:.3f}", one) for one in (-0.0004, 0.0004, -0.0006)] == [
+        "0.000",
+        "0.000",
+        "-0.001",
+    ]
+    assert [known("{:.0%}", -0.001), known("{:.1f} m", -0.04)] == ["0%", "0.0 m"]
+    assert known("{:.3f}", None, "-") == "-"
 
 
 def test_the_best_of_several_is_bold_in_latex_whose_signs_are_escaped():
