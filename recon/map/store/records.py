@@ -240,6 +240,10 @@ class Store:
         """Return a record, not to be changed, without large compressed arrays: see `read`."""
         return self.cache.get((kind, key), lambda: self.read(kind, key))
 
+    def find(self, kind: str, key: Key, **otherwise: Any) -> dict[str, Any]:
+        """Return a record as `get` does, or something else where there is none."""
+        return self.get(kind, key) if self.has(kind, key) else otherwise
+
     def read(self, kind: str, key: Key, *, most_bytes: int = 0) -> dict[str, Any]:
         """Return a record read from the file, past the cache; for those that are read once.
 
