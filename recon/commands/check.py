@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
@@ -84,7 +84,7 @@ def check_map(path: StrPath) -> MapContent:
     file, damaged = file_of_map(path), dict[str, str]()
     numbers: dict[str, Counter[str]] = {}
     sizes: dict[str, Counter[str]] = {}
-    with closing(Store.open(file, read_only=True)) as store:
+    with Store.open(file, read_only=True) as store:
         for kind, name in tracked(store.names(), "records", "check the records"):
             session, _, number = ("", "", "") if kind == LINKS else name.partition(",")
             called = _CALLED.get(kind, kind)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 from recon.commands.config import PAIR_DEFAULTS, ReconConfig, load_config
 from recon.core.errors import SettingsError
 from recon.core.progress import Progress, series
+from recon.core.work import side_by_side
 from recon.evaluation.middlebury.bench import (
     Bench,
     MiddleburySummary,
@@ -128,14 +128,10 @@ def _watched(
     shown: Progress,
 ) -> Iterator[tuple[str, SceneFigures | None]]:
     """Yield figures of each scene, in order, some scenes at once."""
-    pool, last = ThreadPoolExecutor(parallel), time.perf_counter()
-    try:
-        scored = pool.map(score, paths.keys(), paths.values())
-        for name, figures in zip(paths, scored, strict=True):
-            now = time.perf_counter()
-            shown.on_step(SceneDone(name, figures, now - last))
-            last = now
-            yield name, figures
-    finally:
-        # After an error, scenes that have not started are cancelled.
-        pool.shutdown(cancel_futures=True)
+    last = time.perf_counter()
+    scored = side_by_side(lambda scene: score(*scene), paths.items(), threads=parallel)
+    for name, figures in zip(paths, scored, strict=True):
+        now = time.perf_counter()
+        shown.on_step(SceneDone(name, figures, now - last))
+        last = now
+        yield name, figures

@@ -6,7 +6,7 @@ import errno
 import math
 import shlex
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -162,7 +162,7 @@ def run_map(
         with run.stage("write"):
             export_paths(map_.first, mapped.joined, made.T_base_camera, run.content)
             keep_map(map_, run.path(MAP_FILE))
-            with closing(Map.open(run.path(MAP_FILE))) as kept:
+            with Map.open(run.path(MAP_FILE)) as kept:
                 summary = replace(summary, map_mb_per_km=kept.mb_per_km)
         with run.report(summary) as summary:
             # Its figures take long to load, and the drive is mapped without them.

@@ -7,7 +7,6 @@ import math
 import shutil
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -163,5 +162,5 @@ def _checked(one: JobResult) -> dict[str, Any]:
 def _opened(folder: Path, pieces: Sequence[Piece]) -> Iterator[tuple[Map, int]]:
     """Yield the map of each piece, opened one at a time, and the frames of its lead."""
     for number, piece in enumerate(pieces):
-        with closing(Map.open(folder / str(number))) as map_:
+        with Map.open(folder / str(number)) as map_:
             yield map_, piece.lead

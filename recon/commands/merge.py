@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -138,7 +138,7 @@ def run_remove(
     settings = _settings(folder, config)
 
     def fill(run: Run, map_: Map) -> list[int]:
-        with closing(Map.open(folder)) as old:
+        with Map.open(folder) as old:
             without = [] if number is None else [old.session(number)]
             if without and len(old.sessions) < 2:
                 raise SettingsError("the map has only this session", where=folder, got=number)
@@ -276,14 +276,14 @@ def _damage_named(map_: Map, inputs: Sequence[Path]) -> Iterator[None]:
         if str(error.where) == map_.store.name:
             for file in inputs:
                 if file.match(MAP_FILE):
-                    with closing(Map.open(file)) as read:
+                    with Map.open(file) as read:
                         read_all(read)
         raise
 
 
 def _copied(file: Path, map_: Map, settings: ReconConfig) -> list[int]:
     """Copy the drives of a finished map into another; their numbers."""
-    with closing(Map.open(file)) as other:
+    with Map.open(file) as other:
         for session in other.sessions:
             check_session(session, settings)
         return copy_sessions(other, map_)

@@ -21,8 +21,7 @@ from recon.core.values import (
     DisparityTruth,
     Reason,
     Rectified,
-    RectifiedCamera,
-    StereoCalibration,
+    Rig,
     StereoPair,
 )
 from recon.core.values.arrays import UInt8
@@ -191,8 +190,7 @@ def _reconstructor(given: PairInput, config: ReconConfig, run: Run) -> FrameReco
         return FrameReconstructor(rig, config, threads=run.threads, stopwatch=watch)
 
 
-_Rig = RectifiedCamera | StereoCalibration
-Calibration = RectifiedCamera | StereoCalibration | StrPath
+Calibration = Rig | StrPath
 
 
 def match(
@@ -264,8 +262,8 @@ def reconstruct(
     return frame
 
 
-def _rig_of(calibration: Calibration, pair: StereoPair) -> _Rig:
-    if isinstance(calibration, RectifiedCamera | StereoCalibration):
+def _rig_of(calibration: Calibration, pair: StereoPair) -> Rig:
+    if isinstance(calibration, Rig):
         return calibration
     height_px, width_px = pair.left.shape[:2]
     return read_calibration(calibration, width_px, height_px)

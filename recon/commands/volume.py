@@ -60,10 +60,8 @@ def run_volume(
             the runs share no place, or there is no cell to compare.
     """
     if (other is None) == (height_m is None):
-        expected = "either a later run or --height"
-        raise SettingsError(
-            "nothing to compare with, or two things", where="--height", expected=expected
-        )
+        what, expected = "nothing to compare with, or two things", "either a later run or --height"
+        raise SettingsError(what, where="--height", expected=expected)
     within = None
     if within_m is not None:
         if len(within_m) != 4 or not (within_m[0] < within_m[2] and within_m[1] < within_m[3]):

@@ -17,6 +17,12 @@ class Lazy:
         return getattr(import_module(self._name), name)
 
 
+def quiet_open3d() -> Any:
+    """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
+    utility = Lazy("open3d").utility
+    return utility.VerbosityContextManager(utility.VerbosityLevel.Error)
+
+
 SHOWN_BY: Final[dict[str, Callable[[Any], Any]]] = {}
 """What makes each view of a value: code of layers above, which `recon` names when imported."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from recon.core.errors import EvaluationError, RegistrationError, SettingsError
 from recon.core.geometry.alignment import fit_paths
 from recon.core.geometry.se3 import angle_rad, invert, transform_cloud
-from recon.core.lazy import Lazy
+from recon.core.lazy import Lazy, quiet_open3d
 from recon.core.text import counted
 from recon.core.values import (
     MapMetrics,
@@ -146,7 +145,7 @@ def icp(
     source, target = _cloud(xyz - centre), _cloud(reference_xyz - centre)
     criteria = registration.ICPConvergenceCriteria(_CONVERGED, _CONVERGED, _ITERATIONS)
     T, fitness = np.eye(4), 0.0
-    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+    with quiet_open3d():
         target.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(_NORMAL_NEIGHBOURS))
         for reach_m in reaches_m:
             kernel = registration.TukeyLoss(k=reach_m)
@@ -189,7 +188,7 @@ class MapOfRun(NamedTuple):
 def map_of_run(folder: Path) -> MapOfRun:
     """Read what is needed from the map of a run; without one, from its record and path file."""
     if (folder / MAP_FILE).is_file():
-        with closing(MapFile.open(folder)) as map_:
+        with MapFile.open(folder) as map_:
             first = map_.first
             path = first.trajectory.select(map_.joined(first))
             return MapOfRun(path, map_.first.T_map_world, map_.doubts)

@@ -109,13 +109,10 @@ class PairSummary(RunSummary):
 
     def rows(self) -> Rows:
         found, out = self.cloud, shown_path(self.out or "")
-        deep = found.depth_median_m
-        unit = "up to scale"
+        deep, ratio = found.depth_median_m, self.mesh_coverage
         depth = "" if deep is None else f", median depth {metres(deep)}"
-        cloud = f"{found.points:,} points" + (f", {unit}" if self.up_to_scale else depth)
-        covered = (
-            "" if self.mesh_coverage is None else f", {100 * self.mesh_coverage:.0f} % covered"
-        )
+        cloud = f"{found.points:,} points" + (", up to scale" if self.up_to_scale else depth)
+        covered = "" if ratio is None else f", {100 * ratio:.0f} % covered"
         mesh = ("mesh", WHOLE, f"{self.faces:,} faces{covered}")
         return [
             (self.disparity.sentence,),

@@ -53,15 +53,12 @@ def make_costmap(map_: Map, placed: PlacedMap) -> tuple[OccupancyGrid, tuple[str
         MappingError: A drive kept no rays, the robot is wider than a tile, or the band of heights
             (`GridSettings`) is empty.
     """
-    robot, band, observations = (
-        placed.tiles.config.robot,
-        placed.tiles.config.grid,
-        placed.tiles.observations,
-    )
+    config, observations = placed.tiles.config, placed.tiles.observations
+    robot, band = config.robot, config.grid
     if observations is None:
         hint = "map the drive with occupancy.keep_rays=true"
         raise MappingError("a costmap is made of rays, and a drive kept none", hint=hint)
-    if robot.width_m > (tile_m := placed.tiles.config.submaps.tile_m):
+    if robot.width_m > (tile_m := config.submaps.tile_m):
         raise MappingError(
             "the robot is wider than a tile of the map",
             got=f"robot.width_m={robot.width_m:g}",

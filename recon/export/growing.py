@@ -19,7 +19,7 @@ from recon.core.values.arrays import tree_of
 from recon.core.work import serial_algebra, work_in_background
 from recon.export.cloud import even_sample
 from recon.export.costmap import make_costmap
-from recon.export.occupancy import Flattening
+from recon.export.occupancy import Flattening, paste
 from recon.map.builders import Submap
 from recon.map.cut import Rectangle
 from recon.map.map import Map
@@ -166,11 +166,7 @@ def _pasted(
     ]
     low, high = np.minimum(*corners), np.maximum(*ends)
     cells = np.full((high - low)[::-1], UNKNOWN, np.int8)
-    (x, y), (rows, columns) = corners[0] - low, old.cells.shape
-    cells[y : y + rows, x : x + columns] = old.cells
-    first = np.maximum(corners[1], np.floor(np.array(changed.low) / cell_m).astype(int))
-    last = np.minimum(ends[1], np.ceil(np.array(changed.high) / cell_m).astype(int))
-    (x0, y0), (x1, y1) = first - low, last - low
-    (u0, v0), (u1, v1) = first - corners[1], last - corners[1]
-    cells[y0:y1, x0:x1] = new.cells[v0:v1, u0:u1]
+    paste(cells, low, old, low, high)
+    begin, end = np.array(changed.low) / cell_m, np.array(changed.high) / cell_m
+    paste(cells, low, new, np.floor(begin).astype(int), np.ceil(end).astype(int))
     return OccupancyGrid(cells, cell_m, (float(low[0] * cell_m), float(low[1] * cell_m)))

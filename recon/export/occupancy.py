@@ -16,7 +16,7 @@ from recon.core.errors import MappingError
 from recon.core.progress import tracked
 from recon.core.text import metres
 from recon.core.values import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, PointCloud
-from recon.core.values.arrays import Float64, Int32
+from recon.core.values.arrays import Float64, Int32, Int64
 from recon.core.values.grid import log_odds
 from recon.export.product import ExportContext, ExportResult, ProductFigures
 from recon.io.models.columns import write_npz
@@ -170,7 +170,8 @@ class Flattening:
         for key in tracked(around, "tiles"):
             part = self._flat(key, settings, path)
             if part is not None:
-                _paste(cells, low, part, key, self._tiles.edge_cells)
+                begin = np.array(key) * self._tiles.edge_cells
+                paste(cells, low, part, begin, begin + self._tiles.edge_cells)
             self._config.memory.check("putting the grid together")
         origin_m = (low[0] * self._resolution_m, low[1] * self._resolution_m)
         grid = OccupancyGrid(cells, self._resolution_m, origin_m)
@@ -278,14 +279,12 @@ class Flattening:
         return settings, is_driven(np.concatenate(drops), found)
 
 
-def _paste(
-    cells: NDArray[np.int8], low: TileKey, part: OccupancyGrid, key: TileKey, edge: int
+def paste(
+    cells: NDArray[np.int8], low: TileKey | Int64, part: OccupancyGrid, begin: Int64, end: Int64
 ) -> None:
-    """Copy the part of a grid in a tile, ``edge`` cells a side, to cells that start at ``low``."""
+    """Copy what a grid has from ``begin`` to ``end`` (x, y) to cells that start at ``low``."""
     corner = np.rint(np.array(part.origin_m) / part.resolution_m).astype(int)
-    size = np.array(part.cells.shape[::-1])
-    begin = np.maximum(corner, np.array(key) * edge)
-    end = np.minimum(corner + size, (np.array(key) + 1) * edge)
+    begin, end = np.maximum(corner, begin), np.minimum(corner + part.cells.shape[::-1], end)
     if (begin >= end).any():
         return
     (x0, y0), (x1, y1) = begin - low, end - low

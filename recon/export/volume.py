@@ -51,11 +51,9 @@ def volume_between(
     Earth Surface Processes and Landforms 35, 2010 (changes that are sure).
     """
     clouds = [one for one in (before, after) if isinstance(one, PointCloud) and len(one)]
-    cells = np.concatenate(
-        [np.floor(one.xyz[:, :2] / cell_m) for one in clouds] or [np.zeros((0, 2))]
-    )
-    if not len(cells):
+    if not clouds:
         raise MappingError("there are no points to compare")
+    cells = np.concatenate([np.floor(one.xyz[:, :2] / cell_m) for one in clouds])
     (west, south), (east, north) = cells.min(axis=0).astype(int), cells.max(axis=0).astype(int) + 1
     place = RasterPlace(cell_m, int(west), int(north), int(east - west), int(north - south))
     (old_m, old_variance), (new_m, new_variance) = (_heights(place, one) for one in (before, after))

@@ -18,15 +18,13 @@ from recon.look.settings import AuditedSettings, AuditSettings
 from recon.sources.settings import SourceSettings
 from recon.stereo.match.protocol import Matcher
 from recon.stereo.match.registry import EVENED, MatchingSettings, settings_taken
+from recon.stereo.rectify.features import SWAPPED_RATIO
 from recon.stereo.rectify.rectifier import shows_texture
 
 Verdict = Literal["good", "usable", "not usable"]
 Found = Iterator[tuple[str, dict[str, Any]]]  # keys of texts, and figures for them
 _FATAL: Final = {"unreadable", "black", "frozen", "swapped", "lag", "nonrigid", "size"}
 _SIDES = ("left", "right")
-_SWAPPED_RATIO: Final = (
-    0.8  # fraction of negative disparities from which the cameras count as swapped
-)
 _EPIPOLAR_PX: Final = 0.75  # rms epipolar error above which it is reported
 _BAD_EPIPOLAR_PX: Final = (
     1.5  # rms epipolar error above which it is fatal, unless recon map corrects it
@@ -186,7 +184,7 @@ def _of_geometry(look: Look) -> Found:
     swapped, offset = geometry.swapped_ratio, geometry.offset
     if look.shifted:
         yield "lag shifted", {"fatal": False, "paired": look.first[0]}
-    if swapped >= _SWAPPED_RATIO:
+    if swapped >= SWAPPED_RATIO:
         yield "swapped", {"percent": 100 * swapped}
     if offset:
         shift = look.source.shift_of(offset)

@@ -63,7 +63,8 @@ class ArrivingGyro:
         self._R_left = R_left
         self._R_camera_imu: Float64 | None = None
         self._said = False
-        self._bias, self._time_offset_s = np.zeros(3), 0.0
+        self.bias = np.zeros(3)  # radians per second, as far as it is known
+        self._time_offset_s = 0.0
         self._covariance = np.diag(STATED**2)
         self._pixel_rad = 1.0 / focal_px
         self._seen: Motion | None = None
@@ -71,18 +72,13 @@ class ArrivingGyro:
         self._unsteady2 = float("inf")
         self.used = True
 
-    @property
-    def bias(self) -> Float64:
-        """(3,), radians per second, as far as it is known."""
-        return self._bias
-
     def guide(self, last: Motion, seen: Motion, to_s: float) -> Guided | None:
         """Return the turn since the last frame that was seen; None = features know it better."""
         record = self._recent() if self.used else None
         R_camera_imu = None if record is None else self._placed(record)
         if record is None or R_camera_imu is None:
             return None
-        gyro = Gyro(record, R_camera_imu, self._bias, self._time_offset_s)
+        gyro = Gyro(record, R_camera_imu, self.bias, self._time_offset_s)
         if self._seen is None or seen.timestamp_s > self._seen.timestamp_s:
             gyro = self._learnt(gyro, self._seen, seen)
             self._seen = seen
@@ -126,7 +122,7 @@ class ArrivingGyro:
         kept = np.eye(7) - gain @ J
         self._covariance = kept @ P @ kept.T + sigma2 * gain @ gain.T
         gyro = gyro.stepped(gain @ off)
-        self._R_camera_imu, self._bias = gyro.R_camera_imu, gyro.bias
+        self._R_camera_imu, self.bias = gyro.R_camera_imu, gyro.bias
         self._time_offset_s = gyro.time_offset_s
         self._watch(before, seen, lasting_s)
         return gyro

@@ -168,18 +168,22 @@ def _sampled(disparity: Disparity, uv: Float32) -> Float32:
     Tracking features into the right image instead gave two to four times the drift on real drives,
     probably because patches at the edge of an object contain the background, too.
     """
-    height, width = disparity.values.shape
-    column, row = np.rint(uv).astype(np.int64).T
-    offset = np.arange(-_NEIGHBOUR_PX, _NEIGHBOUR_PX + 1)
-    columns = np.clip(column[:, None, None] + offset, 0, width - 1)
-    rows = np.clip(row[:, None, None] + offset[:, None], 0, height - 1)
-    around = disparity.values[rows, columns].reshape(len(uv), offset.size**2)
-    centre = around[:, around.shape[1] // 2]
-    around = np.where(np.isfinite(around), around, centre[:, None])
+    around, centre = values_around(disparity.values, uv, _NEIGHBOUR_PX)
     middle = np.median(around, axis=1)
     agrees = np.abs(middle - centre) <= _MAX_DISPARITY_STEP_PX
     sampled: Float32 = np.where(agrees, middle, np.nan).astype(np.float32)
     return sampled
+
+
+def values_around(values: Float32, uv: Float32, reach_px: int) -> tuple[Float32, Float32]:
+    """Values (N, K) in squares around places (N, 2), the nearest (N,) where one is NaN; and it."""
+    column, row = np.rint(uv).astype(np.int64).T
+    offset = np.arange(-reach_px, reach_px + 1)
+    columns = np.clip(column[:, None, None] + offset, 0, values.shape[1] - 1)
+    rows = np.clip(row[:, None, None] + offset[:, None], 0, values.shape[0] - 1)
+    around = values[rows, columns].reshape(len(uv), offset.size**2)
+    centre = around[:, offset.size**2 // 2]
+    return np.where(np.isfinite(around), around, centre[:, None]), centre
 
 
 _CELL_PX: Final = 40  # edge of a cell of the image

@@ -34,7 +34,7 @@ from recon.core.values import RectifiedCamera, Trajectory
 from recon.core.values.arrays import Bool, Float64
 from recon.core.values.camera import project
 from recon.odometry.kernels import bundle
-from recon.odometry.pose import INDEPENDENCE
+from recon.odometry.pose import INDEPENDENCE, model_of
 from recon.places.closure import (
     USUAL,
     Closure,
@@ -74,7 +74,7 @@ class StoredKeyframes(Protocol):
 class AdjustmentFigures(Figures):
     """How well a path fits points that were left out, before and after it was adjusted."""
 
-    keyframes: int
+    keyframes: int  # that see any of the points
     points: int
     left_out_before_px: float  # median distance from where they should be
     left_out_after_px: float
@@ -85,13 +85,7 @@ class Adjustment:
     """An adjusted path, and how well it fits points that were left out."""
 
     trajectory: Trajectory
-    keyframes: int  # that see any of the points
-    points: int
-    before_px: float  # median distance of what was left out from where it should be, before
-    after_px: float  # and after
-
-    def figures(self) -> AdjustmentFigures:
-        return AdjustmentFigures(self.keyframes, self.points, self.before_px, self.after_px)
+    figures: AdjustmentFigures
 
 
 def adjust_path(
@@ -129,12 +123,9 @@ def adjust_path(
         return None
     # How far what is seen is from where it should be, in the image.
     off_px = [np.hypot(*test.residuals_px(state)[:, :2].T) for state in (before, after)]
-    return Adjustment(
-        optimise_path(path, nodes, T_world_node),
-        len(np.unique(known.seen.node)),
-        known.seen.points,
-        *(float(np.nanmedian(off)) for off in off_px),
-    )
+    seeing, medians = len(np.unique(known.seen.node)), (float(np.nanmedian(off)) for off in off_px)
+    figures = AdjustmentFigures(seeing, known.seen.points, *medians)
+    return Adjustment(optimise_path(path, nodes, T_world_node), figures)
 
 
 class SharedPoints(NamedTuple):
@@ -374,10 +365,8 @@ class Bundle:
 
     @cached_property
     def _model(self) -> bundle.BundleModel:
-        camera, (sigma_uv, sigma_d) = self.camera, self.sigma_px
-        fb = camera.focal_px * camera.baseline_m
-        pinhole = camera.focal_px, camera.cx_px, camera.cy_px, fb, camera.doffs_px
-        return bundle.BundleModel(*pinhole, sigma_uv, sigma_d, self.cauchy_sigmas)
+        (sigma_uv, sigma_d), model = self.sigma_px, model_of(self.camera)
+        return model._replace(sigma_uv=sigma_uv, sigma_d=sigma_d, cauchy=self.cauchy_sigmas)
 
     def _by_node(self, state: State) -> Iterator[tuple[int, slice, _OneFrame]]:
         """Yield each node that sees anything, which sightings, and them as a window of a frame."""

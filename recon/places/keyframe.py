@@ -17,6 +17,7 @@ from recon.core.kernels.voxels import distinct_keys
 from recon.core.values import Disparity, Rectified, RectifiedCamera
 from recon.core.values.arrays import Float32, Float64, UInt8, freeze
 from recon.core.values.camera import depth_from_disparity, unproject
+from recon.odometry.features import values_around
 
 _DESCRIPTOR_BYTES: Final = 32
 FEATURES: Final = 600  # features of a keyframe
@@ -174,14 +175,7 @@ def _spread(corners: Sequence[Any], uv: Float32, shape: tuple[int, ...]) -> NDAr
 
 def _disparity(disparity: Disparity, uv: Float32, camera: RectifiedCamera) -> Float32:
     """The disparity (N,) at features; NaN where unknown, small, or unlike neighbours."""
-    height, width = disparity.values.shape
-    column, row = np.rint(uv).astype(np.int64).T
-    step = np.arange(-1, 2)
-    rows = np.clip(row[:, None, None] + step[:, None], 0, height - 1)
-    columns = np.clip(column[:, None, None] + step, 0, width - 1)
-    around = disparity.values[rows, columns].reshape(len(uv), 9)
-    centre = around[:, 4]
-    around = np.where(np.isfinite(around), around, centre[:, None])
+    around, _ = values_around(disparity.values, uv, 1)
     middle = np.median(around, axis=1)
     with np.errstate(invalid="ignore"):
         good = np.abs(around - middle[:, None]).max(axis=1) <= _MAX_DISPARITY_STEP_PX

@@ -48,11 +48,10 @@ def write_batch_page(
     tables = batch_tables(results)
     write_text(run.path("table.md"), join(table.markdown() for table in tables))
     write_text(run.path("table.tex"), join(table.latex() for table in tables))
-    sweep = sweep_figure(results)
-    if sweep:
-        write_bytes(run.path("sweep.png"), sweep)
-    if over_time := time_figure(results):
-        write_bytes(run.path("time.png"), over_time)
+    sweep, over_time = sweep_figure(results), time_figure(results)
+    for name, png in (("sweep", sweep), ("time", over_time)):
+        if png:
+            write_bytes(run.path(f"{name}.png"), png)
     in_order = results[0].job.command == RUNS
     first = results if in_order else wrong_first(results)
     links = {one.job.name: _link(one, run.folder) for one in first}

@@ -16,7 +16,7 @@ from recon.io.images.image import read_image
 from recon.report import style
 from recon.report.page import run_section, write_page
 from recon.report.sections import Image, Page, Section, Table, known, row_of
-from recon.rig.calibrate.stereo import CONFIDENCE, MATCH_SIGMA_PX
+from recon.rig.calibrate.stereo import CELLS, CONFIDENCE, MATCH_SIGMA_PX
 from recon.rig.calibrate.verdict import CalibrationResult, shared_pixels
 from recon.rig.rectification import RectifyResult
 from recon.run.directory import RunDirectory
@@ -24,7 +24,6 @@ from recon.stereo.rectify.lens import epipolar_curves
 from recon.stereo.rectify.rectifier import Rectifier
 
 Sides = Sequence[Any]  # one value for the left image, one for the right
-_CELLS: Final = (8, 6)
 _DEPTH_ERRORS: Final = ("calibration", "low", "high", "matching")
 
 
@@ -105,8 +104,8 @@ def coverage_figure(result: CalibrationResult) -> bytes:
         ratio = figures[f"coverage_{name}"]
         axes.set_title(f"{name.capitalize()}: {100 * ratio:.0f} % of the cells")
         axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
-        axes.set_xticks(np.linspace(0, width, _CELLS[0] + 1)[1:-1], [])
-        axes.set_yticks(np.linspace(0, height, _CELLS[1] + 1)[1:-1], [])
+        axes.set_xticks(np.linspace(0, width, CELLS[0] + 1)[1:-1], [])
+        axes.set_yticks(np.linspace(0, height, CELLS[1] + 1)[1:-1], [])
         axes.spines[:].set(visible=True, color=style.FAINT)
     covered = "; ".join(axes.get_title() for axes in both)
     return style.to_png(figure, f"Corners that were found. {covered}")

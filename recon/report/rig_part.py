@@ -71,30 +71,22 @@ def field_figure(change: RigChange, size_px: tuple[int, int]) -> bytes:
 def _off_rows(found: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Return what was wrong with what the rig given saw: figure, value, standard deviation."""
     off, time = found["disparity_px"], found["right_time_offset"]
-    late = (
-        []
-        if time["sigma"] is None
-        else [
-            (
-                "time offset of the right images",
-                f"{time['frames']:+.2f} frames",
-                f"{time['sigma']:.2f}",
-            )
-        ]
-    )
     depths = (
         (f"depth at {depth} m", f"{of['mean']:+.1f} %", f"{of['sigma']:.1f} %")
         if of["mean"] is not None
         else (f"depth at {depth} m", "infinite", NOT_KNOWN)
         for depth, of in found["depth_percent"].items()
     )
-    return [
+    rows = [
         ("disparity, mean", f"{off['mean']:+.2f} px", f"{off['sigma']:.2f} px"),
         ("disparity, rms over the image", f"{off['rms']:.2f} px", NOT_KNOWN),
         *depths,
         ("epipolar error, rms over the image", f"{found['epipolar_error_px']:.2f} px", NOT_KNOWN),
-        *late,
     ]
+    if time["sigma"] is not None:
+        frames = f"{time['frames']:+.2f} frames"
+        rows.append(("time offset of the right images", frames, f"{time['sigma']:.2f}"))
+    return rows
 
 
 def _turn_rows(parameters: Mapping[str, Any]) -> list[tuple[str, ...]]:

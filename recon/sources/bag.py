@@ -217,11 +217,7 @@ def read_topic(bag: Bag, name: str, image_topic: str, *, stamped: bool) -> ReadP
     (parent, child), poses = _choose_frames(list(bag.poses(name)), where)
     stamps = [pose.stamp_ns if stamped else pose.recorded_ns for pose in poses]
     times_ns, first = np.unique(stamps, return_index=True)
-    for pose in poses:
-        norm = float(np.linalg.norm(pose.xyzw))
-        if not (np.isfinite(pose.xyz_m).all() and np.isfinite(norm) and norm > 0):
-            raise FormatError("pose is not finite, or has no rotation", where=where)
-    path = Trajectory(np.stack([_transform(poses[index]) for index in first]), times_ns * NS)
+    path = Trajectory(np.stack([pose_matrix(pose, where) for pose in poses])[first], times_ns * NS)
     camera = bag.frame_id(image_topic)
     with reading(bag.paths[0]):
         T_child_camera = static_transform(_static_edges(bag), child, camera)
@@ -262,6 +258,14 @@ def _choose_frames(poses: list[BagPose], where: str) -> tuple[tuple[str, str], l
         expected, hint = "one, or one in the frame odom", "name a topic of odometry or poses"
         raise SourceError(what, where=where, got=got, expected=expected, hint=hint)
     return chosen[0], found[chosen[0]]
+
+
+def pose_matrix(pose: BagPose, where: str) -> Float64:
+    """Return a pose as float64 (4, 4); `FormatError` if it is none."""
+    norm = float(np.linalg.norm(pose.xyzw))
+    if not (np.isfinite(pose.xyz_m).all() and np.isfinite(norm) and norm > 0):
+        raise FormatError("pose is not finite, or has no rotation", where=where)
+    return _transform(pose)
 
 
 def _transform(pose: BagPose) -> Float64:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, ReconError, SettingsError, SourceError
-from recon.core.geometry.se3 import invert, make_transform, rotation_from_quaternion
+from recon.core.geometry.se3 import invert
 from recon.core.progress import LOGGER, stage
 from recon.core.text import counted
 from recon.core.values import ImuRecord, Recorded, Rig, StereoPair, Trajectory, check_size
@@ -37,7 +37,7 @@ from recon.io.ros.contents import (
     stamp_ns,
 )
 from recon.io.ros.dds import Network, NetworkTopic, Received
-from recon.sources.bag import find_mount, static_transform
+from recon.sources.bag import find_mount, pose_matrix, static_transform
 from recon.sources.calibration import read_rig
 from recon.sources.settings import SourceSettings
 from recon.sources.source import Mount, SourceFigures, StereoSource
@@ -286,7 +286,7 @@ class Ros2Source(StereoSource):
             rows = self._rates.setdefault(one.topic, deque(maxlen=_FAST))
             rows.append([stamp_ns(message), *imu_row(message)])
         elif one.kind in POSES:
-            poses = [(p.stamp_ns, p.child, _matrix(p, one.topic)) for p in poses_of(message, 0)]
+            poses = [(p.stamp_ns, p.child, pose_matrix(p, one.topic)) for p in poses_of(message, 0)]
             if one.topic == INITIAL_POSE:
                 self._start = poses[0][-1]
             else:
@@ -336,13 +336,6 @@ class Ros2Source(StereoSource):
         if fault not in self._refused:
             LOGGER.warning("%s; not used", error)
         self._refused[fault] += 1
-
-
-def _matrix(pose: BagPose, where: str) -> Float64:
-    norm = float(np.linalg.norm(pose.xyzw))
-    if not (np.isfinite(pose.xyz_m).all() and np.isfinite(norm) and norm > 0):
-        raise FormatError("pose is not finite, or has no rotation", where=where)
-    return make_transform(rotation_from_quaternion(pose.xyzw), pose.xyz_m)
 
 
 @contextmanager

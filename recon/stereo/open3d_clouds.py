@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.errors import SettingsError, ShapeError
-from recon.core.lazy import Lazy
+from recon.core.lazy import Lazy, quiet_open3d
 from recon.core.values.arrays import Bool, Float32, Float64, Int32
 
 o3d = Lazy("open3d")
@@ -41,7 +41,7 @@ def statistical_inliers(xyz: NDArray[Any], neighbours: int, sigmas: float) -> Bo
     """Return bool (N,): the mean distance to neighbours is within ``sigmas`` of that of all."""
     if len(xyz) <= neighbours:
         return np.ones(len(xyz), dtype=bool)
-    with _quiet():
+    with quiet_open3d():
         _, index = _legacy(xyz).remove_statistical_outlier(neighbours, sigmas)
     mask = np.zeros(len(xyz), dtype=bool)
     mask[np.asarray(index, dtype=np.intp)] = True
@@ -60,7 +60,7 @@ def radius_inliers(xyz: NDArray[Any], neighbours: int, radius_m: float | NDArray
 def estimate_normals(xyz: NDArray[Any], neighbours: int) -> Float32:
     """Return unit normals (N, 3) of planes fitted to each point's neighbours, of arbitrary sign."""
     cloud = _legacy(xyz)
-    with _quiet():
+    with quiet_open3d():
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
     return _array(cloud.normals)
 
@@ -83,7 +83,7 @@ def agree_normals(xyz: NDArray[Any], normals: NDArray[Any], neighbours: int) -> 
 
 def _orient(cloud: Any, normals: NDArray[Any], neighbours: int) -> Float32:
     cloud.normals = o3d.utility.Vector3dVector(np.array(normals, dtype=np.float64))
-    with _quiet():
+    with quiet_open3d():
         cloud.orient_normals_consistent_tangent_plane(min(neighbours, len(cloud.points) - 1))
     return _array(cloud.normals)
 
@@ -114,7 +114,7 @@ def nearest(
         )
     tensor = o3d.core.Tensor.from_numpy
     near_origin, points = (tensor(np.array(xyz, dtype=np.float32)) for xyz in moved)
-    with _quiet():
+    with quiet_open3d():
         search = o3d.core.nns.NearestNeighborSearch(near_origin)
         search.knn_index()
         index, squared = search.knn_search(points, neighbours)
@@ -123,7 +123,7 @@ def nearest(
 
 def _voxelised(cloud: Any, voxel_m: float) -> Any:
     try:
-        with _quiet():
+        with quiet_open3d():
             return cloud.voxel_down_sample(voxel_m)
     except RuntimeError as error:
         raise SettingsError(
@@ -145,8 +145,3 @@ def _finite(xyz: NDArray[Any]) -> Float64:
 
 def _array(vectors: Any) -> Float32:
     return np.asarray(vectors).astype(np.float32)
-
-
-def _quiet() -> Any:
-    """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
-    return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)

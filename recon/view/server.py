@@ -386,13 +386,11 @@ def _html(lines: Iterable[str]) -> str:
 
 def _add_grid(api: Any, name: str, grid: OccupancyGrid, ground: GroundSurface) -> None:
     """Drape a grid over the ground, the cells that are known: those of a large one are merged."""
-    from recon.report.style import colour_grid  # noqa: PLC0415 - not for the first points
+    from recon.report.drive_figures import thin_grid  # noqa: PLC0415 - not for the first points
+    from recon.report.style import colour_grid  # noqa: PLC0415
 
     while (grid.cells != UNKNOWN).sum() > _MOST_CELLS:
-        cells = grid.cells  # an occupied one counts most, an unknown one least
-        for axis in (0, 1):
-            cells = np.maximum.reduceat(cells, np.arange(0, cells.shape[axis], 2), axis=axis)
-        grid = OccupancyGrid(cells, 2.0 * grid.resolution_m, grid.origin_m)
+        grid = thin_grid(grid, -(-max(grid.cells.shape) // 2))
     row, column = np.nonzero(grid.cells != UNKNOWN)
     corners = np.column_stack([column, row])[:, None] + _SQUARE
     xy = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)

@@ -88,8 +88,8 @@ def test_noise_leaves_centimetres_and_wrong_points_no_more(truth, closed, wrong)
     assert np.array_equal(found.trajectory.T_world_camera[0], closed.trajectory.T_world_camera[0])
     aligned = replace(truth, T_world_camera=first @ truth.T_world_camera)
     assert _off_m(found.trajectory, aligned) < 0.02 < 0.3 * _off_m(closed.trajectory, aligned)
-    assert found.after_px < found.before_px
-    assert found.keyframes == FRAMES
+    assert found.figures.left_out_after_px < found.figures.left_out_before_px
+    assert found.figures.keyframes == FRAMES
 
 
 def test_what_fits_no_better_is_not_used(truth, closed, monkeypatch):
@@ -111,8 +111,8 @@ def test_a_drive_of_too_many_keyframes_is_thinned(truth, closed, monkeypatch):
     monkeypatch.setattr(adjustment, "_MOST_SIGHTINGS", 1000)
     found = adjust_path(drive_path(truth), closed, _keyframes(truth, 3), CAMERA)
     assert found is not None
-    assert found.keyframes <= 15
-    assert found.points < 500
+    assert found.figures.keyframes <= 15
+    assert found.figures.points < 500
 
 
 def test_points_that_keyframes_share_are_where_a_path_puts_them(truth, closed):

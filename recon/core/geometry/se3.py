@@ -19,7 +19,7 @@ from recon.core.errors import FormatError
 from recon.core.values import Frame, PointCloud
 from recon.core.values.arrays import Float64
 
-_FARTHEST_M: Final = 1e5  # from the first camera to the origin of a map: farther than any drive
+FARTHEST_M: Final = 1e5  # from the first camera, or along a ray: farther than any drive
 _RIGID_TOLERANCE: Final = 1e-6
 
 
@@ -145,7 +145,7 @@ def check_rigid(name: str, T: Float64, where: Path | None = None) -> None:
     if not (
         T.shape == (4, 4)
         and np.isfinite(T).all()
-        and np.abs(T[:3, 3]).max() <= _FARTHEST_M
+        and np.abs(T[:3, 3]).max() <= FARTHEST_M
         and np.array_equal(T[3], [0, 0, 0, 1])
         and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), rtol=0, atol=_RIGID_TOLERANCE)
         and np.linalg.det(T[:3, :3]) > 0
@@ -154,7 +154,7 @@ def check_rigid(name: str, T: Float64, where: Path | None = None) -> None:
             f"{name} is not a rigid transform of a map",
             where=where,
             got=T.tolist(),
-            expected=f"a rotation and at most {_FARTHEST_M:g} m",
+            expected=f"a rotation and at most {FARTHEST_M:g} m",
         )
 
 

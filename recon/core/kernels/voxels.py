@@ -130,37 +130,31 @@ def unpack_key(key: int) -> tuple[int, int, int]:
 
 
 @kernel
-def _place(key: int, mask: int) -> int:
-    """Return where the search for a packed cell begins."""
+def _place(table: Int64, key: int) -> int:
+    """Return the place of a packed cell in a hash, or the unused one where it belongs."""
     # Two rounds of multiplicative hashing; 32-bit factors keep the products inside an int64.
-    mixed = ((key >> 32) * 0x9E3779B1 ^ key) & 0x7FFFFFFF
-    return ((mixed * 0x85EBCA6B) >> 22) & mask
+    mask, mixed = len(table) - 1, ((key >> 32) * 0x9E3779B1 ^ key) & 0x7FFFFFFF
+    place = ((mixed * 0x85EBCA6B) >> 22) & mask
+    while table[place, 0] != EMPTY and table[place, 0] != key:
+        place = (place + 1) & mask
+    return place
 
 
 @kernel
 def find_or_add(table: Int64, key: int, next_row: int) -> int:
     """Return the row of a packed cell, or enter it with ``next_row``; there is an unused place."""
-    mask = len(table) - 1
-    place = _place(key, mask)
-    while table[place, 0] != EMPTY:
-        if table[place, 0] == key:
-            return int(table[place, 1])
-        place = (place + 1) & mask
-    table[place, 0] = key
-    table[place, 1] = next_row
-    return next_row
+    place = _place(table, key)
+    if table[place, 0] == EMPTY:
+        table[place, 0] = key
+        table[place, 1] = next_row
+    return int(table[place, 1])
 
 
 @kernel
 def find(table: Int64, key: int) -> int:
     """Return the row of a packed cell, or `EMPTY` where it is not in the hash."""
-    mask = len(table) - 1
-    place = _place(key, mask)
-    while table[place, 0] != EMPTY:
-        if table[place, 0] == key:
-            return int(table[place, 1])
-        place = (place + 1) & mask
-    return EMPTY
+    # Of unused places the row is `EMPTY`, too.
+    return int(table[_place(table, key), 1])
 
 
 @kernel
@@ -186,13 +180,11 @@ def add_points(voxels: VoxelSums, points: VoxelPoints, edge: float, frame: int) 
     ``edge`` is that of a voxel in the unit of the points; frames come in order.
     """
     done = 0
-    while True:
-        # Plain tuples: numba's cache on disk would remember the classes by name, and break when
-        # one is renamed.
-        done = _add_points(tuple(voxels), tuple(points), edge, frame, done)
-        if done == len(points.xyz):
-            return voxels
+    # Plain tuples: numba's cache on disk would remember the classes by name, and break when one is
+    # renamed.
+    while (done := _add_points(tuple(voxels), tuple(points), edge, frame, done)) < len(points.xyz):
         voxels = reserve_sums(voxels, len(voxels.keys) + 1)
+    return voxels
 
 
 @kernel

@@ -7,12 +7,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from recon.core.errors import MeshingError
 from recon.core.values import TriangleMesh
 from recon.core.values.arrays import Bool, Float32, Float64, Int32, Int64
+from recon.map.occupancy.bodies import pieces_of
 from recon.stereo import open3d_clouds
 
 _CANDIDATES: Final = 8
@@ -205,8 +204,7 @@ def component_labels(faces: Int32) -> tuple[Int32, Int32]:
 
 def components(pairs: Int64, count: int) -> Int32:
     """Return int32 (count,), the connected part of each of ``count`` things, given pairs (P, 2)."""
-    graph = coo_matrix((np.ones(len(pairs), np.bool_), pairs.T), (count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+    return pieces_of(count, pairs).astype(np.int32)
 
 
 def meeting_sides(faces: NDArray[np.signedinteger]) -> Int64:

@@ -28,8 +28,7 @@ def write_lines(
     """
     pyogrio = require("pyogrio", extra="survey")
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE})
-    heads = [struct.pack("<BII", 1, 2, len(line)) for line in lines]
-    shapes = [head + line.astype("<f8").tobytes() for head, line in zip(heads, lines, strict=True)]
+    shapes = [struct.pack("<BII", 1, 2, len(xy)) + xy.astype("<f8").tobytes() for xy in lines]
     system = _LOCAL if crs is None else check_crs(crs).to_wkt()
     with atomic_path(path) as temporary:
         try:

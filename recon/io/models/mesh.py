@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from recon.core.errors import FormatError, MeshingError, OutputError, SettingsError
 from recon.core.geometry.se3 import T_YUP_FRAME, make_transform
-from recon.core.lazy import Lazy
+from recon.core.lazy import Lazy, quiet_open3d
 from recon.core.text import counted
 from recon.core.values import RectifiedCamera, Texture, TriangleMesh
 from recon.core.values.arrays import Float32, Float64, Int32, UInt8
@@ -62,7 +62,7 @@ def write_mesh(path: StrPath, mesh: TriangleMesh, frame: Frame | None = None) ->
     elif suffix == ".obj" and texture is not None:
         _write_textured_obj(Path(path), mesh, texture)
     else:
-        with atomic_path(path) as temporary, _quiet():
+        with atomic_path(path) as temporary, quiet_open3d():
             surface = to_open3d(mesh)
             surface.compute_triangle_normals()
             if not o3d.io.write_triangle_mesh(temporary, surface):
@@ -123,7 +123,7 @@ def read_mesh(path: StrPath) -> TriangleMesh:
     if suffix == ".ply":
         mesh = _read_ply(path)
     elif Path(path).is_file():
-        with _quiet():
+        with quiet_open3d():
             found = o3d.io.read_triangle_mesh(Path(path))
         if not found.has_triangles():
             raise FormatError("the file has no triangles that Open3D can read", where=path)
@@ -281,7 +281,7 @@ def decimate(
     vertices: NDArray[Any], faces: NDArray[Any], target_faces: int
 ) -> tuple[Float32, Int32]:
     """Collapse edges until about ``target_faces`` are left (Garland & Heckbert, 1997)."""
-    with _quiet():
+    with quiet_open3d():
         smaller = _surface(vertices, faces).simplify_quadric_decimation(
             target_faces, boundary_weight=3.0
         )
@@ -301,11 +301,6 @@ def _surface(vertices: NDArray[Any], faces: NDArray[Any]) -> Any:
 
 def _vectors(values: NDArray[Any]) -> Any:
     return o3d.utility.Vector3dVector(np.array(values, dtype=np.float64))
-
-
-def _quiet() -> Any:
-    """Keep Open3D's warnings off standard output; errors that matter are checked and raised."""
-    return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
 
 
 _IDENTITY: Final = np.eye(4)

@@ -177,8 +177,9 @@ class Network:
                 now_s, found = time.monotonic(), list[Received]()
                 for one in self._readers:
                     taken = one.reader.take(one.depth, condition=one.condition)
-                    contents = [bytes(sample.content) for sample in taken if _is_whole(sample)]
-                    found += [Received(one.topic, one.kind, each, now_s) for each in contents]
+                    contents = (getattr(sample, "content", None) for sample in taken)
+                    whole = (bytes(each) for each in contents if isinstance(each, bytes))
+                    found += [Received(one.topic, one.kind, each, now_s) for each in whole]
             yield found
 
     def write(self, topic: str, time_ns: int, message: Message, *, kept: bool = False) -> None:
@@ -274,10 +275,6 @@ def _keep_inside(descriptors: set[int]) -> None:
 def _domain(number: int, configuration: str) -> Any:
     """Begin a domain, once in a process, as Cyclone has it; "" = by its defaults."""
     return require("cyclonedds.domain", extra="ros2").Domain(number, configuration or None)
-
-
-def _is_whole(sample: Any) -> bool:
-    return isinstance(getattr(sample, "content", None), bytes)
 
 
 def _kind_of(type_name: str) -> str | None:

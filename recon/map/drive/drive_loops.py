@@ -73,7 +73,7 @@ class DriveLoops:
             refused_by_graph=refused,
             refused=dict(sorted(self.refused.items())),
             largest_correction_m=float(self.corrections_m.max(initial=0.0)),
-            adjusted=None if self.adjustment is None else self.adjustment.figures(),
+            adjusted=None if self.adjustment is None else self.adjustment.figures,
         )
 
     def record(self) -> dict[str, Any]:

@@ -214,13 +214,9 @@ class SubmapBuilder:
         self._occupancy = OccupancyBuilder(occupancy, T_map_world)
         self._index = 0
         self._first_frame = 0
-        self._frames = 0
+        self.frames = 0
         self._path_m = 0.0
         self._last_m: Float64 | None = None
-
-    @property
-    def frames(self) -> int:
-        return self._frames
 
     def integrate(
         self,
@@ -236,18 +232,18 @@ class SubmapBuilder:
         if self._last_m is not None:
             self._path_m += float(np.linalg.norm(place - self._last_m))
         self._last_m = place.copy()
-        self._frames += 1
+        self.frames += 1
 
     @property
     def full(self) -> bool:
         s, limit = self._settings, self._max_bytes
-        long = self._path_m >= s.length_m or self._frames >= _MAX_FRAMES
+        long = self._path_m >= s.length_m or self.frames >= _MAX_FRAMES
         return long or (limit is not None and self._fused.nbytes + self._occupancy.nbytes >= limit)
 
     def current(self) -> Submap:
         """Return the submap so far; without frames it is empty."""
         return Submap(
-            self._index, self._first_frame, self._frames, self._fused.part(), self._occupancy.part()
+            self._index, self._first_frame, self.frames, self._fused.part(), self._occupancy.part()
         )
 
     def close(self) -> Submap:
@@ -255,12 +251,12 @@ class SubmapBuilder:
         submap = Submap(
             self._index,
             self._first_frame,
-            self._frames,
+            self.frames,
             self._fused.take().rounded(),
             self._occupancy.take(),
         )
-        self._first_frame += self._frames
-        self._index, self._frames, self._path_m = self._index + 1, 0, 0.0
+        self._first_frame += self.frames
+        self._index, self.frames, self._path_m = self._index + 1, 0, 0.0
         return submap
 
     def state(self) -> dict[str, Any]:
@@ -270,7 +266,7 @@ class SubmapBuilder:
     def restore(self, state: dict[str, Any]) -> None:
         submap = Submap.from_tree(state["submap"])
         self._index, self._first_frame = submap.index, submap.first_frame
-        self._frames = submap.frames
+        self.frames = submap.frames
         self._path_m, self._last_m = state["path_m"], state["last_m"]
         self._fused.resume(submap.fused, submap.frames)
         self._occupancy.resume(submap.occupancy)

@@ -171,13 +171,11 @@ def cast_rays(evidence: Blocks, rays: Rays, spread: float) -> Blocks:
     zero length says nothing.
     """
     done = 0
-    while True:
-        # Plain tuples: numba's cache on disk would remember the classes by name, and break when
-        # one is renamed.
-        done = _cast_rays(tuple(evidence), tuple(rays), done, spread, False)
-        if done == len(rays.ends):
-            return evidence
+    # Plain tuples: numba's cache on disk would remember the classes by name, and break when one is
+    # renamed.
+    while (done := _cast_rays(tuple(evidence), tuple(rays), done, spread, False)) < len(rays.ends):
         evidence = reserve(evidence, len(evidence.keys) + 1, make_blocks)
+    return evidence
 
 
 def blocks_of(keys: Int64) -> Blocks:

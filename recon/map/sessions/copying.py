@@ -16,8 +16,7 @@ from recon.core.text import counted
 from recon.core.values.arrays import Float64
 from recon.map.builders import Submap
 from recon.map.ground.level import Level
-from recon.map.kernels import clamped
-from recon.map.occupancy.part import OccupancyPart
+from recon.map.occupancy.part import join_occupancy
 from recon.map.sessions.joining import T_one_other, link_by_frame
 from recon.map.sessions.placed import check_rays
 from recon.map.settings import DriveSettings
@@ -147,8 +146,7 @@ def join_parts(
 
 def keep_map(mapped: MapFile, path: Path) -> None:
     """Write the map of finished drives, but for occupancy, which is made of rays again."""
-    blocks, starts, cells = np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros(0, np.uint16)
-    nothing = OccupancyPart(clamped.CellRows(blocks, starts, cells, np.zeros((0, 3), np.float32)))
+    nothing = join_occupancy(())
     with MapFile.create(path) as kept:
         for session in mapped.sessions:
             start = {name: kept_ for name, kept_ in session.info.start.items() if name == IMAGES}

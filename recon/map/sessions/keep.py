@@ -35,13 +35,9 @@ class Keep:
         for text in texts:
             name, value = _condition(text)
             if not name or name in found or (found and "all" in (name, *found)):
-                what, one = (
-                    "not what a map may keep",
-                    "drives (2), days (90d), X0,Y0,X1,Y1 in metres",
-                )
-                raise SettingsError(
-                    what, where=where, got=text, expected=f"{one}, each once; or all"
-                )
+                what = "not what a map may keep"
+                expected = "drives (2), days (90d), X0,Y0,X1,Y1 in metres, each once; or all"
+                raise SettingsError(what, where=where, got=text, expected=expected)
             found[name] = value
         found.pop("all", None)
         return cls(**found)

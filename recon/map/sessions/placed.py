@@ -8,7 +8,6 @@ comes of it is what one process makes: parts are numbered by submap, and joined 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -280,7 +279,7 @@ def _cut_submaps(
 ) -> None:
     """Cut some submaps of a map into tiles, in a file."""
     numbers, file = task
-    with closing(MapFile.open(map_file)) as map_:
+    with MapFile.open(map_file) as map_:
         placed = PlacedSubmaps(map_, settings)
         T = placed.corrections
         cutter = Cutter(settings, map_.first.T_map_world, halvings)
@@ -303,7 +302,7 @@ def _make_tiles(
     """Make the voxels and points of some tiles, and find the floors in them, in a file."""
     keys, file = task
     tiles = taken(path=file)
-    with closing(MapFile.open(map_file)) as map_:
+    with MapFile.open(map_file) as map_:
         tiles.observations = observations_of(map_, settings)
         for key in keys:
             tiles.make_voxels(key)

@@ -105,10 +105,9 @@ class MapFile:
     @property
     def links(self) -> list[Link]:
         """The places that two drives saw, those that contradict the others included."""
-        if not self.store.has(LINKS, 0):
-            return []
         with reading(self.store.name):
-            links = [Link.from_tree(tree) for tree in self.store.get(LINKS, 0)["links"]]
+            trees = self.store.find(LINKS, 0, links=())["links"]
+            links = [Link.from_tree(tree) for tree in trees]
             for link in links:
                 (one, other), loop = map(self.session, link.sessions), link.loop
                 if not (0 <= loop.first < len(one) and 0 <= loop.last < len(other)):
@@ -204,10 +203,9 @@ class MapFile:
     @property
     def forgotten(self) -> list[Forgotten]:
         """The drives that left the map, by number."""
-        if not self.store.has(FORGOTTEN, 0):
-            return []
         with reading(self.store.name):
-            return [value_in(Forgotten, tree) for tree in self.store.get(FORGOTTEN, 0)["drives"]]
+            drives = self.store.find(FORGOTTEN, 0, drives=())["drives"]
+            return [value_in(Forgotten, tree) for tree in drives]
 
     def set_forgotten(self, forgotten: Collection[Forgotten]) -> None:
         """Keep which drives left the map."""

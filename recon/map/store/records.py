@@ -240,6 +240,10 @@ class Store:
         """Return a record, not to be changed, without large compressed arrays: see `read`."""
         return self.cache.get((kind, key), lambda: self.read(kind, key))
 
+    def find(self, kind: str, key: Key, **otherwise: Any) -> dict[str, Any]:
+        """Return a record as `get` does, or something else where there is none."""
+        return self.get(kind, key) if self.has(kind, key) else otherwise
+
     def read(self, kind: str, key: Key, *, most_bytes: int = 0) -> dict[str, Any]:
         """Return a record read from the file, past the cache; for those that are read once.
 
@@ -431,12 +435,8 @@ class Cache:
     def __init__(self, limit_bytes: int) -> None:
         self._limit = limit_bytes
         self._held: OrderedDict[Hashable, tuple[Any, int]] = OrderedDict()
-        self._size = 0
+        self.nbytes = 0
         self._lock = Lock()
-
-    @property
-    def nbytes(self) -> int:
-        return self._size
 
     def get(self, key: Hashable, make: Callable[[], Value]) -> Value:
         """Return the value of a key, made now unless it is kept; two threads may both make it."""
@@ -450,20 +450,20 @@ class Cache:
         if size > self._limit:  # would drive out everything else, and then itself
             return value
         with self._lock:
-            self._size += size - self._held.pop(key, (None, 0))[1]
+            self.nbytes += size - self._held.pop(key, (None, 0))[1]
             self._held[key] = value, size
-            while self._size > self._limit:
-                self._size -= self._held.popitem(last=False)[1][1]
+            while self.nbytes > self._limit:
+                self.nbytes -= self._held.popitem(last=False)[1][1]
         return value
 
     def drop(self, key: Hashable) -> None:
         with self._lock:
-            self._size -= self._held.pop(key, (None, 0))[1]
+            self.nbytes -= self._held.pop(key, (None, 0))[1]
 
     def clear(self) -> None:
         with self._lock:
             self._held.clear()
-            self._size = 0
+            self.nbytes = 0
 
 
 def size_of(value: object) -> int:

@@ -120,7 +120,7 @@ class Session:
                 for T, time_s, health in frames_in(store.read(FRAMES, (number, first))):
                     self.add_frame(T, time_s, health)
             self._flushed = len(self)
-            axes = store.get(AXES, number) if store.has(AXES, number) else {}
+            axes = store.find(AXES, number)
             self.mount = value_in(Mount, axes["mount"]) if "mount" in axes else None
             if self.mount is not None:
                 check_rigid("T_base_camera", self.mount.T_base_camera)
@@ -225,9 +225,7 @@ class Session:
     @property
     def loops(self) -> dict[str, Any]:
         """Result of loop closure: ``closed`` and ``refused`` loops, ``T_world_camera`` after it."""
-        if not self._store.has(LOOPS, self.number):
-            return {}
-        return self._store.get(LOOPS, self.number)
+        return self._store.find(LOOPS, self.number)
 
     @property
     def closed(self) -> tuple[Loop, ...]:

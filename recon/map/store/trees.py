@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from recon.core.dates import DateFrom
 from recon.core.errors import FormatError, ShapeError
-from recon.core.geometry.se3 import check_rigid
+from recon.core.geometry.se3 import FARTHEST_M, check_rigid
 from recon.core.values import (
     CameraIntrinsics,
     RayCloud,
@@ -183,7 +183,6 @@ def _adapters(kind: Any) -> dict[str, TypeAdapter[Any]]:
 
 
 FRAMES: Final = "frames"
-FARTHEST_M: Final = 1e5  # from the start: farther than any drive, or ray
 _SKEW: Final = 1e-3  # of poses that were written with few digits
 _HEALTH: Final = tuple(f.name for f in fields(OdometryHealth))
 

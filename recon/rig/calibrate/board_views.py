@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -16,6 +15,7 @@ from recon.core.progress import tracked
 from recon.core.text import counted
 from recon.core.values.arrays import Float32, Float64, UInt8
 from recon.core.values.board import CalibrationBoard
+from recon.core.work import side_by_side
 from recon.io.images.image import read_image, write_image
 from recon.rig.calibrate.bundle import Sighting, View
 from recon.rig.calibrate.detect import (
@@ -99,15 +99,14 @@ def _look_at_all(
     files: Sequence[Path], board: CalibrationBoard, threads: int
 ) -> tuple[CalibrationBoard, list[_Look]]:
     """Return detections in all images, and the board, which may have the other layout."""
-    with ThreadPoolExecutor(threads) as pool:
-        seen = pool.map(lambda path: _look(path, board), files)
-        looks = list(tracked(seen, "images", "find the board", total=len(files)))
-        if not board.dictionary or any(look.seen for look in looks):
-            return board, looks
-        other = replace(board, legacy=not board.legacy)
-        seen = pool.map(lambda path: _look(path, other), files)
-        older = list(tracked(seen, "images", "find its other layout", total=len(files)))
-        return (other, older) if any(look.seen for look in older) else (board, looks)
+    seen = side_by_side(lambda path: _look(path, board), files, threads=threads)
+    looks = list(tracked(seen, "images", "find the board", total=len(files)))
+    if not board.dictionary or any(look.seen for look in looks):
+        return board, looks
+    other = replace(board, legacy=not board.legacy)
+    seen = side_by_side(lambda path: _look(path, other), files, threads=threads)
+    older = list(tracked(seen, "images", "find its other layout", total=len(files)))
+    return (other, older) if any(look.seen for look in older) else (board, looks)
 
 
 def _look(path: Path, board: CalibrationBoard) -> _Look:

@@ -22,7 +22,7 @@ import numpy as np
 from recon.core.geometry.alignment import nearest_sorted
 from recon.core.kernels.compiled import UInt16
 from recon.core.values import Disparity, Reason, RectifiedPair
-from recon.core.values.arrays import Bool, Float32, Float64, Int64, UInt8, frozen_array
+from recon.core.values.arrays import Bool, Float32, UInt8, frozen_array
 from recon.stereo.kernels import filling as kernels
 from recon.stereo.kernels.planes import mark_hidden
 from recon.stereo.kernels.refine import SIGMA_LARGEST_PX
@@ -83,8 +83,8 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
         for plane, ratio in zip(planes, ratios, strict=True):  # the smallest segments first
             wanted = ~(sure | filled | unseen | outside(plane[0]))
             support = np.empty((3, *sure.shape), np.uint8)
-            weigh = partial(_weigh, seen.values, distances, plane, wanted, support)
-            common.in_strips(pool, threads, weigh, len(sure))
+            given = seen.values, distances, plane, wanted, SAME_SURFACE_PX
+            common.run_kernel(pool, threads, len(sure), kernels.weigh_planes, given, support)
             taken = (ratio >= _LEAST_RATIO) & (support[2] <= _WIDEST_GAP) & (support[1] == 0)
             taken |= support[0] == kernels.DIRECTIONS
             values[taken] = plane[0][taken]
@@ -104,21 +104,9 @@ def fill(pair: RectifiedPair, seen: Disparity, threads: int) -> Disparity:
 def _distances(known: Bool, pool: Executor) -> UInt16:
     """Return the steps to the next known pixel in each direction, uint16 (8, H, W)."""
     distances = np.empty((kernels.DIRECTIONS, *known.shape), np.uint16)
-    jobs = [
-        pool.submit(kernels.find_nearest, known, direction, of)
-        for direction, of in enumerate(distances)
-    ]
-    for job in jobs:
-        job.result()
+    find = partial(kernels.find_nearest, known)
+    list(pool.map(find, range(kernels.DIRECTIONS), distances))
     return distances
-
-
-def _weigh(
-    values: Float32, distances: UInt16, planes: Float32, wanted: Bool, to: UInt8, rows: range
-) -> None:
-    kernels.weigh_planes(
-        values, distances, planes, wanted, SAME_SURFACE_PX, rows.start, rows.stop, to
-    )
 
 
 def outside(values: Float32) -> Bool:
@@ -184,12 +172,8 @@ def _count_votes(pair: RectifiedPair, values: Float32, reach: int, pool: Executo
     grey = np.asarray(cv2.blur(pair.left, (3, 3)), np.uint8)  # without the noise of single pixels
     alike = np.exp(np.arange(256) / -_LEVELS).astype(np.float32)
     vote = kernels.Vote(_VOTERS * reach, _STRIDE, SAME_SURFACE_PX, _SLOPE)
-    own = np.empty(values.shape, np.float32)
-
-    def take(rows: range) -> None:
-        kernels.take_votes(values, grey, alike, marked, vote, rows.start, rows.stop, own)
-
-    common.in_strips(pool, _STRIPS, take, len(values))
+    own, given = np.empty(values.shape, np.float32), (values, grey, alike, marked, vote)
+    common.run_kernel(pool, _STRIPS, len(values), kernels.take_votes, given, own)
     return own
 
 
@@ -209,7 +193,6 @@ the planes of all are offered."""
 SEGMENTATIONS: Final = len(_EDGES)
 SAME_SURFACE_PX: Final = 1.0  # disparities that are farther apart are of two surfaces
 _LEAST_PX: Final = 100  # smaller segments have the planes of windows
-_Known = tuple[Float32, Float32, Int64, Int64, Int64, Float64, float]
 _TRIES: Final = 150  # planes through three pixels: one of them is right where a third lies on it
 
 
@@ -238,14 +221,10 @@ def fit_segments(
         wanted = np.flatnonzero(sizes >= _LEAST_PX)
         wanted = wanted[wanted > 0]  # 0 are edges
         if len(wanted):
-            known = seen.values, seen.confidence, order, starts, wanted, draws, SAME_SURFACE_PX
-            fit = partial(_fit_some, known, planes, ratio)
-            common.in_strips(pool, threads, fit, len(wanted))
+            given = seen.values, seen.confidence, order, starts, wanted, draws, SAME_SURFACE_PX
+            count, fit = len(wanted), kernels.fit_segments
+            common.run_kernel(pool, threads, count, fit, given, planes, ratio)
     return ratios
-
-
-def _fit_some(known: _Known, to: Float32, ratios: Float32, segments: range) -> None:
-    kernels.fit_segments(*known, segments.start, segments.stop, to, ratios)
 
 
 def smooth_colours(pair: RectifiedPair) -> UInt8:

@@ -147,15 +147,9 @@ class FineMatcher:
             for first in range(0, height, at_once):
                 end = min(first + at_once, height)
                 ours, others = (d.describe(first, end, pool, self._threads) for d in describers)
-                add = partial(_add_learned, ours, others, width, minimum, volume[first:end])
-                common.in_strips(pool, self._threads, add, end - first)
+                given, to = (ours, others, width, minimum, _BLEND), volume[first:end]
+                common.run_kernel(pool, self._threads, len(to), add_dissimilarity, given, to)
         return volume
-
-
-def _add_learned(
-    left: Int32, right: Int32, width: int, minimum: int, costs: UInt8, rows: range
-) -> None:
-    add_dissimilarity(left, right, width, minimum, _BLEND, rows.start, rows.stop, costs)
 
 
 def _copy_costs(volume: UInt8, _columns: int) -> WriteCosts:
@@ -247,8 +241,8 @@ def search_planes(
             for done in sweeps:
                 done.result()
             chosen = np.empty((3, *size), np.float32)
-            choose = partial(_choose, sums, sources, table, chosen)
-            common.in_strips(pool, threads, choose, size[0])
+            given, choose = (*sums, sources, table), kernels.choose_planes
+            common.run_kernel(pool, threads, size[0], choose, given, chosen)
             sources[NOW] = sources[FITTED] = chosen
             last = number + 1 == len(_ROUNDS)
             radius = _LAST_FIT_PX if last else _NEAR_FIT_PX
@@ -257,10 +251,6 @@ def search_planes(
     chosen, fitted = sources[NOW, 0], sources[FITTED, 0]
     near_by = np.abs(fitted - chosen) < SAME_SURFACE_PX / 2
     return np.asarray(np.where(near_by, fitted, chosen), dtype=np.float32)
-
-
-def _choose(sums: Float32, sources: Float32, table: Int32, to: Float32, rows: range) -> None:
-    kernels.choose_planes(sums[0], sums[1], sources, table, rows.start, rows.stop, to)
 
 
 class _Fits:
@@ -277,18 +267,10 @@ class _Fits:
         """Write the planes of all pixels, (3, H, W); ``own``: with the values that they have."""
         nodes = np.empty((3, *(-(-n // kernels.NODE_PX) for n in values.shape)), np.float32)
         stride = max(1, radius // _SAMPLES)
-
-        def fit_rows(rows: range) -> None:
-            kernels.fit_nodes(
-                *(values, weights, self.guide, self._alike, radius, stride),
-                *(SAME_SURFACE_PX, rows.start, rows.stop, nodes),
-            )
-
-        def spread_rows(rows: range) -> None:
-            kernels.spread_nodes(nodes, values, own, rows.start, rows.stop, to)
-
-        common.in_strips(self._pool, self._threads, fit_rows, nodes.shape[1])
-        common.in_strips(self._pool, self._threads, spread_rows, len(values))
+        on, fitted = (self._pool, self._threads), (nodes, values, own)
+        given = values, weights, self.guide, self._alike, radius, stride, SAME_SURFACE_PX
+        common.run_kernel(*on, nodes.shape[1], kernels.fit_nodes, given, nodes)
+        common.run_kernel(*on, len(values), kernels.spread_nodes, fitted, to)
 
 
 def _table(near: int, far: int, number: int) -> Int32:
@@ -352,19 +334,11 @@ class Describer:
             rows = (bottom - first) // size + 2 * (size > 1)
             part = image[first // size : first // size + rows + 2 * _LAYERS]
             to = np.empty((rows, layers[-1].bias.size // 2, image.shape[2]), np.int32)
-            common.in_strips(pool, threads, partial(_convolve, part, layers, to), rows)
+            convolve = convolution.convolve_rows
+            common.run_kernel(pool, threads, rows, convolve, (part, layers), to)
             found.append(to)
-        full, half, quarter = found
-        common.in_strips(pool, threads, partial(_unite, full, half, quarter), end - first)
-        return full[: end - first]
-
-
-def _convolve(image: Int32, layers: tuple[convolution.Layer, ...], to: Int32, rows: range) -> None:
-    convolution.convolve_rows(image, layers, rows.start, rows.stop, to)
-
-
-def _unite(full: Int32, half: Int32, quarter: Int32, rows: range) -> None:
-    convolution.unite(full, half, quarter, rows.start, rows.stop)
+        common.run_kernel(pool, threads, end - first, convolution.unite, found)
+        return found[0][: end - first]  # those of full size
 
 
 def load_network() -> Network:

@@ -122,7 +122,8 @@ def make_matcher(
         given = protocol.PLUGINS.load(matcher, *own)
         return AutoRangeMatcher(protocol.CheckedMatcher(given, name_of(matcher)))
     made = MATCHERS[matcher](settings, threads)
-    if "fill" in settings_taken(matcher) and _fills(matcher, settings):
+    ours = settings.fill == "ours" and field_of(matcher) != "opencv"
+    if "fill" in settings_taken(matcher) and (ours or settings.fill is True):
         made = FillingMatcher(made, getattr(made, "reach_px", 0), threads)
     if matcher in EVENED:
         made = EveningMatcher(made)
@@ -130,10 +131,6 @@ def make_matcher(
     if settings.ndisp is not None or "ndisp" not in settings_taken(matcher):
         return made
     return AutoRangeMatcher(made, settings.min_disparity_px)
-
-
-def _fills(matcher: str, settings: MatchingSettings) -> bool:
-    return settings.fill is True or (settings.fill == "ours" and field_of(matcher) != "opencv")
 
 
 def check_matcher(matcher: str | Matcher) -> None:

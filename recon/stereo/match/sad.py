@@ -102,12 +102,8 @@ class SadMatcher:
         whole = undivided(halved, shape)
         found = self._half.find(pool, views, halved, whole, rules, asked)
         tiles = divided(search, pair.left.shape)
-        where = found.values, search.minimum, search.ndisp, SUPPORT
-
-        def offer(rows: range) -> None:
-            offer_supported(*where, rows.start, rows.stop, tiles)
-
-        common.in_strips(pool, self._threads, offer, len(tiles.offered))
+        given, rows = (found.values, search.minimum, search.ndisp, SUPPORT), len(tiles.offered)
+        common.run_kernel(pool, self._threads, rows, offer_supported, given, tiles)
         return tiles
 
 

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from typing import Annotated, Final, Generic, Literal, TypeVar
+from typing import Annotated, Any, Final, Generic, Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -121,12 +121,9 @@ def finish(refined: Refined, pool: Executor, threads: int, *, average: bool = Tr
     reject(small, int(Reason.SPECKLE), refined)
     if not average:
         return Disparity(*refined)
-    averages, how = np.empty_like(refined.values), (_AVERAGE_PX // 2, _SAME_SURFACE_PX)
-
-    def average_rows(rows: range) -> None:
-        average_opposite(refined.values, *how, rows.start, rows.stop, averages)
-
-    in_strips(pool, threads, average_rows, len(averages))
+    averages = np.empty_like(refined.values)
+    given = refined.values, _AVERAGE_PX // 2, _SAME_SURFACE_PX
+    run_kernel(pool, threads, len(averages), average_opposite, given, averages)
     return Disparity(*refined._replace(values=averages))
 
 
@@ -138,6 +135,16 @@ def in_strips(pool: Executor, threads: int, work: Callable[[range], None], rows:
     work(last)
     for job in handed_over:
         job.result()
+
+
+def run_kernel(
+    pool: Executor, threads: int, rows: int, kernel: Callable[..., None], given: Any, *to: Any
+) -> None:
+    """Run a kernel on all rows, in strips, each from a row to a row.
+
+    Its arguments are what is ``given``, these rows, and what it writes ``to``.
+    """
+    in_strips(pool, threads, lambda some: kernel(*given, some.start, some.stop, *to), rows)
 
 
 def usual_ndisp(width_px: int) -> int:

@@ -193,7 +193,7 @@ _OUTLIER_PX: Final = 3.0  # between the epipolar error of a wrong match and that
 INSPECTED: Final = 1000  # maximum number of features per image of a pair that is inspected
 _MIN_FEATURES: Final = 40  # with fewer matched features there is no verdict
 _WARN_EPIPOLAR_PX: Final = 1.0  # median epipolar error that gives a warning, in pixels
-_SWAPPED_RATIO: Final = 0.8  # of near features with negative disparity: swapped cameras
+SWAPPED_RATIO: Final = 0.8  # of near features with negative disparity: swapped cameras
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ def inspect_features(
 
 def check_inspection(inspection: PairInspection, where: str | None = None) -> tuple[str, ...]:
     """Return warnings about a pair; none if it is good or has too few features."""
-    if inspection.negative_ratio >= _SWAPPED_RATIO:
+    if inspection.negative_ratio >= SWAPPED_RATIO:
         raise CalibrationError(
             "left and right images are swapped",
             where=where,
