@@ -135,7 +135,7 @@ class Year:
                 self._keep_all(map_, before, seconds * (1 - joined), week)
 
     def time_again(self) -> None:
-        """Time the second and the last week once more, in turn: the machine may not be as it was."""
+        """Time the second and the last week again, in turn: the machine may not be as it was."""
         seconds: dict[int, list[float]] = {week: [] for week in self.timed}
         again = self.folder / "again"
         for _, week in product(range(ROUNDS), self.timed):
