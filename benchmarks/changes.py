@@ -8,12 +8,15 @@ is `free` then. It is found if the box of an object of its kind overlaps its own
 replaced, of either kind. An object is false if its box overlaps nothing that changed: cars,
 hoarding, fence, the growing tree; crowns of trees, where leaves are of another season.
 
-WEEKS has the weeks as folders (image_2, image_3, calib.txt, times.txt, T_street_first.npy), or they
+WEEKS has the weeks as folders (image_0, image_1, calib.txt, times.txt, T_street_first.npy), or they
 are rendered; RUNS their maps, which are made where they are missing.
 
-Of HALVES, two runs of one drive, nothing but what drives may be found; all objects are counted.
+Of DRIVES, the even and the odd frames are mapped as two runs, between which nothing changed but
+what drives: all objects are counted, and the volume that seems to be between them.
 
-Example: python benchmarks/changes.py RUNS --weeks WEEKS --pairs 0-1,50-51 --json
+Examples:
+    python benchmarks/changes.py --runs RUNS --weeks WEEKS --pairs 0-1,50-51 --json
+    python benchmarks/changes.py --pairs none --drives drives/one drives/other --json
 """
 
 from __future__ import annotations
@@ -21,7 +24,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import tempfile
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -33,6 +38,8 @@ from recon.commands.config import load_config
 from recon.commands.diff import run_diff
 from recon.commands.map import run_map
 from recon.commands.map_options import MapOptions
+from recon.commands.volume import run_volume
+from recon.map.map import Map
 from recon.sources.registry import open_source
 from recon.street.shapes import Material
 from tests.scenery.year import (
@@ -54,20 +61,36 @@ OFF_M = 0.3  # by how much boxes may miss each other: a voxel, and the error of 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("runs", type=Path, help="folder of the maps of weeks, and of the results")
+    parser.add_argument("--runs", type=Path, help="folder of maps and results; default: nowhere")
     parser.add_argument("--weeks", type=Path, help="folder of rendered weeks")
-    parser.add_argument("--pairs", default="0-1", help="weeks to compare, such as 0-1,50-51")
-    parser.add_argument("--halves", type=Path, nargs=2, help="two runs in which nothing changed")
+    parser.add_argument("--pairs", default="0-1", help="weeks to compare, as 0-1,50-51, or none")
+    parser.add_argument("--drives", type=Path, nargs="+", default=[], help="cut into halves")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args(arguments)
-    if options.halves is not None:
-        before, after = options.halves
-        found = run_diff(before, after, MapOptions("diff", options.runs / "halves"))
-        rows = [{"objects": len(found.objects), "not_compared": found.not_compared_ratio}]
-    else:
-        pairs = [[*map(int, pair.split("-"))] for pair in options.pairs.split(",")]
-        rows = [weeks(one, other, options.runs, options.weeks) for one, other in pairs]
-    print(json.dumps(rows, indent=2) if options.json else "\n".join(map(str, rows)))
+    pairs = [] if options.pairs == "none" else options.pairs.split(",")
+    with tempfile.TemporaryDirectory() as folder:
+        runs = Path(folder) if options.runs is None else options.runs
+        numbers = [[*map(int, pair.split("-"))] for pair in pairs]
+        rows = [weeks(one, other, runs, options.weeks) for one, other in numbers]
+        found = {"weeks": rows, "drives": [unchanged(drive, runs) for drive in options.drives]}
+    print(json.dumps(found, indent=2) if options.json else "\n".join(map(str, found.items())))
+
+
+def unchanged(drive: Path, runs: Path) -> dict[str, Any]:
+    """Compare the even with the odd frames of a drive."""
+    even, odd = (runs / f"{drive.name}-{half}" for half in ("even", "odd"))
+    for start, out in enumerate((even, odd)):
+        if not (out / "summary.json").is_file():
+            config = load_config(None, [f"source.start={start}", "source.stride=2"])
+            source, options = MapOptions(source=drive, mesh=False).open(config)
+            run_map(source, config, replace(options, out=out))
+    found = run_diff(even, odd, MapOptions("diff", runs / f"{drive.name}-diff"))
+    volume = run_volume(even, odd).volume
+    with Map.open(even) as map_:
+        path_m = map_.first.trajectory.path_length_m
+    return {"drive": drive.name, "path_m": path_m, "objects": len(found.objects),
+            "not_compared": found.not_compared_ratio, "seconds": found.seconds,
+            "volume": asdict(volume)}  # fmt: skip
 
 
 def weeks(before: int, after: int, runs: Path, rendered: Path | None) -> dict[str, Any]:

@@ -360,6 +360,38 @@ def year(found: Found) -> Rows:
     return rows
 
 
+def changes(found: Found) -> Rows:
+    """What a comparison of two weeks finds of what was parked, by weeks."""
+    return {
+        f"weeks {one['weeks'][0] + 1} and {one['weeks'][1] + 1}": {
+            "cars that came or went": "{} of {}".format(*one["found_of"]["free"]),
+            "replaced": "{} of {}".format(*one["found_of"]["replaced"]),
+            "objects": one["objects"],
+            "false": len(one["false"]),
+            "not compared": 100 * max(one["not_compared"].values()),
+        }
+        for one in found["changes"]["weeks"]
+    }
+
+
+def unchanged(found: Found) -> Rows:
+    """What a comparison of two halves of a drive finds, by drive."""
+    rows: Rows = {}
+    for one in found["changes"]["drives"]:
+        volume = one["volume"]
+        rows[one["drive"]] = {
+            "path": one["path_m"],
+            "objects": one["objects"],
+            "not compared": 100 * max(one["not_compared"].values()),
+            "volume": f"{volume['net_m3']:.1f} ± {volume['sigma_m3']:.1f} m³",
+            "height": 1e3 * volume["net_m3"] / volume["compared_m2"],
+            "area": volume["compared_m2"],
+            "cut": volume["cut_m3"],
+            "fill": volume["fill_m3"],
+        }
+    return rows
+
+
 def surfaces(found: Found) -> Rows:
     """How much of what is seen at a depth a map has, and how much of it is right."""
     return {

@@ -338,6 +338,21 @@ TABLES: Final[dict[str, Table]] = {
         | {"last found at 3 cm": "{:.0f} %", "off": CM},
         rows_of.year,
     ),
+    "changes": Table(
+        {"changes": "python benchmarks/changes.py --pairs 0-1,50-51,0-51,12-14,25-26,0-26 --json"},
+        {"cars that came or went": "{}", "replaced": "{}", "objects": "{}", "false": "{}"}
+        | {"not compared": "{:.0f} %"},
+        rows_of.changes,
+    ),
+    "unchanged": Table(
+        {
+            "changes": "python benchmarks/changes.py --pairs none --drives "
+            f"{D06} {D13} $RECON_DATA/driven/town_60 $RECON_DATA/driven/kitti_05_100 --json"
+        },
+        {"path": "{:.0f} m", "objects": "{}", "not compared": "{:.0f} %", "volume": "{}"}
+        | {"height": "{:.1f} mm", "area": "{:.0f} m²", "cut": "{:.1f} m³", "fill": "{:.1f} m³"},
+        rows_of.unchanged,
+    ),
     "surfaces": Table(
         {
             "as it comes": "python benchmarks/surfaces.py $RECON_DATA/rendered/yard --json",
