@@ -209,7 +209,7 @@ def test_conditions_are_read_as_people_write_them():
 @pytest.mark.parametrize(
     "texts",
     [["0"], ["1.5"], ["-3"], ["nan"], ["infd"], ["d"], [""], ["1,2,3"], ["5,0,1,9"], ["x"],
-     ["3", "2"], ["all", "3"], ["3", "all"], ["-1d"], ["1,2,3,4d"]],
+     ["3", "2"], ["all", "3"], ["3", "all"], ["-1d"], ["1,2,3,4d"], ["1_0"], ["\uff12"]],
 )  # fmt: skip
 def test_what_is_no_condition_is_refused_in_one_line(texts):
     with pytest.raises(SettingsError, match=r"--keep.*not what a map may keep") as caught:
