@@ -24,18 +24,12 @@ from recon.core.text import counted
 from recon.core.work import Stopwatch, use_threads
 from recon.io.fields import write_yaml
 from recon.io.files import StrPath, fingerprint, read_text, reading, resolved
-from recon.run.directory import (
-    RECORD,
-    STARTED,
-    RunDirectory,
-    default_folder,
-    recorded_files,
-)
+from recon.run.directory import RECORD, STARTED, RunDirectory, default_folder, recorded_files
 
 CONFIG: Final = "config.yaml"
 SUMMARY: Final = "summary.json"
 _MAP: Final = Path("map", STARTED)
-_MAPPING: Final = ("map", "demo", "live", "merge")  # commands that put a map in place of a map
+_MAPPING: Final = ("map", "demo", "live", "merge", "piece")  # a map in place of another
 Summary = TypeVar("Summary", bound=RunSummary)
 
 
