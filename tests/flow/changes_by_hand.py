@@ -179,6 +179,7 @@ voxel_m, doublings = (
 largest_m = voxel_m * 2**doublings
 sigmas = [one["sigma"].astype(float) for one in clouds]
 worst_m = 2 * math.hypot(*(float(sigma.max()) for sigma in sigmas))
+usual_m = 2 * math.hypot(*(float(np.percentile(sigma, 99)) for sigma in sigmas))
 for n in (0, 1):
     mine, others = xyz[day == n], xyz[day == 1 - n]
     away_m, kinds = distances(mine, others, 2 * largest_m + worst_m), change[day == n]
@@ -346,7 +347,7 @@ for box in truth["boxes"]:
     for one in here:
         hits.append(one["number"])
         beyond = np.maximum(low - found[one["number"]][0], found[one["number"]][1] - high).max()
-        must(beyond < OFF_M + worst_m, f"object {one['number']} is {beyond:.2f} m too large")
+        must(beyond < OFF_M + usual_m, f"object {one['number']} is {beyond:.2f} m too large")
         size = float(np.prod(high - low))
         must(one["volume_m3"] is None or one["volume_m3"] - 2 * one["volume_sigma_m3"] <= size,
              f"object {one['number']} has more volume than its box")  # fmt: skip
