@@ -74,7 +74,8 @@ def batch(
       recon batch --table outputs/monday outputs/friday --out outputs/table
     """
     if [bool(what), resume is not None, watch is not None].count(True) != 1:
-        raise typer.BadParameter("give JOBS, COMMAND and SOURCES, --resume or --watch FOLDER")
+        one = "JOBS, COMMAND and SOURCES, --table RUNS"
+        raise typer.BadParameter(f"give {one}, --resume or --watch FOLDER")
     with one_line_errors(quiet=quiet, verbose=verbose):
         if watch is not None:
             from recon.cli.watch import show_batch

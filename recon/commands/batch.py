@@ -25,6 +25,7 @@ from recon.run.batch.results import (
     work_off,
 )
 from recon.run.directory import default_folder
+from recon.run.finished import refuse_as_target
 from recon.run.run import Run
 
 
@@ -65,6 +66,8 @@ def run_batch(
 def run_table(runs: Sequence[Path], out: Path | None = None) -> BatchSummary:
     """Make the tables and the report of a batch of runs that are there: `recon batch --table`."""
     folder = resolved(out or default_folder("batch"))
+    for run_ in runs:
+        refuse_as_target(run_, folder)
     results = compare(runs_by_date(runs, folder))
     with Run("batch", folder) as run:
         with run.report(_summary(results, 0, 0.0)) as summary:

@@ -135,7 +135,8 @@ def read_text(path: StrPath, at_most: int | None = None) -> str:
         return read_bytes(path, at_most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         utf_16 = error.object[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-        got, hint = f"byte {error.start} is not UTF-8", "save it as UTF-8" if utf_16 else None
+        is_text = utf_16 or b"\0" not in error.object
+        got, hint = f"byte {error.start} is not UTF-8", "save it as UTF-8" if is_text else None
         raise FormatError("not a text file", where=path, got=got, hint=hint) from error
 
 

@@ -25,9 +25,10 @@ _NAMES: Final = {
 _UNIT: Final = re.compile(r" *[\[(](m|metres?|meters?|deg|degrees|°|s|px)[\])]$|_(m|deg|s|px)$")
 _COMMENT: Final = re.compile(r"(^|\s)(#|//).*")
 _DECIMAL: Final = re.compile(r"([-+]?\d+),(\d+)", re.ASCII)
+_FIELD: Final = r'(?:^|[;\t])[ "]*[-+]?{}[ "]*(?:$|[;\t])'
 _DMS: Final = re.compile(
-    r"([NSEW]?)\s*(-?)(\d+)\s*[°d:\s]\s*([0-5]?\d)\s*['\u2032:\s]\s*([0-5]?\d(?:\.\d*)?)\s*"
-    r"(?:[\"\u2033]|'')?\s*([NSEW]?)",
+    r"([NSEW]?)\s*(-?)(\d+)\s*[°ºd:\s]\s*([0-5]?\d)\s*['\u2019\u2032:\s]\s*"
+    r"([0-5]?\d(?:\.\d*)?)\s*(?:[\"\u201d\u2033]|['\u2019\u2032]{2})?\s*([NSEW]?)",
     re.ASCII | re.IGNORECASE,
 )
 Columns = dict[str, int]
@@ -43,12 +44,15 @@ def read_rows(path: StrPath, begin: int = 0) -> tuple[Columns, list[Row]]:
     lines = read_text(path).splitlines()
     if not any(mark in line for line in lines for mark in ";\t"):
         lines = read_lines(path)  # refuses decimal commas
-    rows = [
-        (f"{path}:{n}", fields(text))
+    texts = [
+        (f"{path}:{n}", text)
         for n, line in enumerate(lines, 1)
         if n > begin and (text := _COMMENT.sub("", line).strip())
     ]
+    _refuse_thousands(texts)
+    rows = [(where, fields(text)) for where, text in texts]
     if rows and not any(map(is_number, rows[0][1])) and (columns := columns_of(rows[0][1], path)):
+        _refuse_more(rows[1:], len(rows[0][1]))
         return columns, rows[1:]
     for line in lines[begin:]:
         if _COMMENT.sub("", line).strip():
@@ -57,6 +61,26 @@ def read_rows(path: StrPath, begin: int = 0) -> tuple[Columns, list[Row]]:
         if rows and len(words) == len(rows[0][1]) and len(named := columns_of(words, path)) > 2:
             return named, rows
     return {}, rows
+
+
+def _refuse_thousands(texts: Sequence[tuple[str, str]]) -> None:
+    """Refuse what may be thousands, as ``455,810``, where decimals have the other mark."""
+    for mark, other in ((",", r"\."), (r"\.", ",")):
+        either = re.compile(_FIELD.format(rf"[1-9]\d{{0,2}}{mark}\d{{3}}"), re.ASCII)
+        decimal = re.compile(_FIELD.format(rf"\d+{other}\d+"), re.ASCII)
+        found = next(((where, text) for where, text in texts if either.search(text)), None)
+        if found and any(decimal.search(text) for _, text in texts):
+            what, hint = "decimals or thousands", "write decimals with one mark, and no thousands"
+            raise FormatError(what, where=found[0], got=found[1][:60], hint=hint)
+
+
+def _refuse_more(rows: Sequence[Row], names: int) -> None:
+    """Refuse rows with more fields than names, but for a text at the end that has commas."""
+    for where, words in rows:
+        if len(words) > names and any(map(is_number, words[names - 1 :])):
+            got, hint = f"{len(words)} fields", "are commas in decimals? put ; between fields"
+            what, expected = "a row has more fields than the header", f"{names}"
+            raise FormatError(what, where=where, got=got, expected=expected, hint=hint)
 
 
 def first_row(text: str) -> str:
@@ -100,8 +124,10 @@ def pick(row: Row, columns: Columns, kinds: Sequence[str]) -> list[str]:
 def fields(line: str) -> list[str]:
     """Return what lies between semicolons or tabs, and may have decimal commas; commas; spaces."""
     mark = next((mark for mark in ";\t," if mark in line), " ")
-    words = next(csv.reader([line.strip(" ,")], delimiter=mark, skipinitialspace=True), [])
+    words = next(csv.reader([line.strip()], delimiter=mark, skipinitialspace=True), [])
     plain = [word.strip() for word in words]
+    while plain and not plain[-1]:
+        plain.pop()
     return [_DECIMAL.sub(r"\1.\2", word) for word in plain] if mark in ";\t" else plain
 
 

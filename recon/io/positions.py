@@ -29,9 +29,10 @@ from recon.io.named_table import (
     pick,
     read_rows,
 )
-from recon.io.trajectory import check_positions
+from recon.io.trajectory import UNIT_TOLERANCE, check_positions
 
-_COUNTS: Final = (4, 5, 7, 8)  # columns of a table without a header; 8 of TUM
+_OF_TUM: Final = 8
+_COUNTS: Final = (4, 5, 7, _OF_TUM)  # columns of a table without a header
 _SIGMAS: Final = ("sigma", "sigma_e", "sigma_n", "sigma_u")
 # Standard deviations of a horizontal coordinate in metres at a dilution of precision of 1, by the
 # quality that NMEA 0183 states in GGA: autonomous, differential, RTK fixed, RTK floating.
@@ -150,9 +151,17 @@ def _read_table(path: Path) -> Positions:
     if not columns:
         named = {5: _SIGMAS[:1], 7: _SIGMAS[1:]}.get(count, ())
         columns = {kind: n for n, kind in enumerate((*place, *named))}
-        rows = [(at, [str(x) for x in parse_row(row, _COUNTS, at)]) for at, row in rows]
+        counts = (count,) if count in _COUNTS else _COUNTS
+        numbers = [(at, parse_row(row, counts, at)) for at, row in rows]
+        for at, row in numbers:
+            norm = np.linalg.norm(row[4:]) if count == _OF_TUM else 1.0
+            if abs(norm - 1.0) > UNIT_TOLERANCE:
+                what, hint = "quaternion is not of unit length", "are commas in decimals?"
+                raise FormatError(what, where=at, got=f"{norm:g}", hint=hint)
+        rows = [(at, [str(x) for x in row]) for at, row in numbers]
     kinds = (*place, *(kind for kind in _SIGMAS if kind in columns))
-    table = np.array([_numbers(pick(row, columns, kinds), range(len(kinds)), path) for row in rows])
+    every = range(len(kinds))
+    table = np.array([_numbers(pick(row, columns, kinds), every, row[0]) for row in rows])
     if not rows:
         raise FormatError("the file has no position", where=path)
     if not degrees:
@@ -165,7 +174,7 @@ def _read_table(path: Path) -> Positions:
     return Positions(table[:, 0], table[:, 1:4], sigma_m, degrees=degrees)
 
 
-def _numbers(words: Sequence[str], columns: Sequence[int], path: Path) -> list[float]:
+def _numbers(words: Sequence[str], columns: Sequence[int], path: StrPath) -> list[float]:
     try:
         return [float(number) for number in parse_numbers([words[n] for n in columns])]
     except (IndexError, ValueError) as error:
@@ -405,10 +414,15 @@ def _as_listed(row: Row, columns: Columns) -> list[str]:
         named = len(words) > 6 and not is_number(words[0])
         return [*words[1:7], words[0], *words[7:]] if named else words
     plane = ("lon", "lat") if {"lat", "lon"} <= {*columns} else ("east", "north")
-    name = ("name",) if "name" in columns else ()
-    listed = pick(row, columns, (*plane, "height", "column", "row", "image", *name))
-    at = columns.get("check", len(words))
-    return [*listed, *(_CHECK for word in words[at : at + 1] if word.lower() == _CHECK)]
+    listed = pick(row, columns, (*plane, "height", "column", "row", "image"))
+    name, check = (
+        "".join(words[at : at + 1])
+        for at in (columns.get(kind, len(words)) for kind in ("name", "check"))
+    )
+    if check.lower() not in ("", _CHECK):
+        expected = f"{_CHECK}, or nothing"
+        raise FormatError("not a check point, nor none", where=row[0], got=check, expected=expected)
+    return [*listed, name, *([_CHECK] if check else [])]
 
 
 def _row(words: list[str], where: str) -> _Row:

@@ -25,7 +25,7 @@ from recon.io.files import StrPath, parse_row, read_lines, read_table, read_text
 
 # Files print rotations with four to seven digits; a larger deviation means it is not a rotation.
 _RIGID_TOLERANCE = 1e-3
-_UNIT_TOLERANCE = 1e-2
+UNIT_TOLERANCE = 1e-2
 # Geocentric and projected map coordinates stay below 1e7 m.
 _FARTHEST_M = 1e8
 _EUROC_COLUMNS: Final = 17  # time, pose, velocity and biases
@@ -212,7 +212,7 @@ def _from_tum(rows: Rows, path: StrPath) -> Trajectory:
     check_positions(table[:, 1:4], lines, path)
     norms = np.linalg.norm(table[:, 4:], axis=1)
     for norm, line in zip(norms, lines, strict=True):
-        if abs(norm - 1) > _UNIT_TOLERANCE:
+        if abs(norm - 1) > UNIT_TOLERANCE:
             what = "quaternion is not of unit length"
             raise FormatError(what, where=f"{path}:{line}", got=f"{norm:g}")
     backwards = np.diff(table[:, 0]) < 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,16 +16,20 @@ from typing import Any, Final, TypeVar
 from typing_extensions import Self
 
 from recon.core import progress
+from recon.core.errors import OutputError
 from recon.core.machine import peak_memory_mb, versions
 from recon.core.settings import Settings
 from recon.core.summary import RunSummary
+from recon.core.text import counted
 from recon.core.work import Stopwatch, use_threads
 from recon.io.fields import write_yaml
-from recon.io.files import StrPath, fingerprint, resolved
-from recon.run.directory import RECORD, RunDirectory, default_folder
+from recon.io.files import StrPath, fingerprint, read_text, reading, resolved
+from recon.run.directory import RECORD, STARTED, RunDirectory, default_folder, recorded_files
 
 CONFIG: Final = "config.yaml"
 SUMMARY: Final = "summary.json"
+_MAP: Final = Path("map", STARTED)
+_MAPPING: Final = ("map", "demo", "live", "merge", "piece")  # a map in place of another
 Summary = TypeVar("Summary", bound=RunSummary)
 
 
@@ -65,6 +70,8 @@ class Run(RunDirectory):
         self._start = time.perf_counter()
 
     def __enter__(self) -> Self:
+        if not self.resumes and _MAP in recorded_files(self.folder):
+            self._refuse_to_lose_map()
         super().__enter__()
         try:
             if self._config is not None:
@@ -73,6 +80,15 @@ class Run(RunDirectory):
             self.__exit__(*sys.exc_info())
             raise
         return self
+
+    def _refuse_to_lose_map(self) -> None:
+        """Refuse results in place of a map that is none of theirs, or of several drives."""
+        with reading(path := self.folder / SUMMARY):
+            drives = len(json.loads(read_text(path)).get("sessions", ())) or 1
+        if self.command not in _MAPPING or (drives > 1 and not self.whole):
+            what, got = "the results would replace a map", f"one of {counted(drives, 'drive')}"
+            hint = "another --out; recon map --into adds a drive"
+            raise OutputError(what, where=self.folder, got=got, hint=hint)
 
     def write_config(self, config: Settings) -> None:
         """Write ``config.yaml``, anew where some settings are known only now."""

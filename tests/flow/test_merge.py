@@ -176,7 +176,8 @@ def _refused(*words: str | Path) -> str:
     ("first", "the same run twice"),
     ("copy", "has this drive already"),
     ("pair", "the run made no map"),
-    ("coarse", "voxels of different sizes"),
+    ("coarse", "voxels of different sizes (got 0.2 m, expected 0.1 m); map it again with --set"),
+    ("scaled", "(got 0.2 m, expected 0.1 m); map it again with --set scene.scale=1, or into"),
     ("newer", "newer version of recon"),
     ("odd", "odd/map/map.recon: content cannot be read (got KeyError: 'grain')"),
 ])  # fmt: skip
@@ -186,11 +187,12 @@ def test_a_wrong_merge_is_one_line(runs, tmp_path, second, message):
         shutil.copytree(runs / ("first" if second == "copy" else "second"), other)
     if second == "pair":
         (other / "run.json").write_text('{"command": "pair"}')
-    elif second in ("coarse", "newer", "odd"):
+    elif second in ("coarse", "scaled", "newer", "odd"):
         with Map.open(other, read_only=False) as map_:
-            if second == "coarse":
+            if second in ("coarse", "scaled"):
                 info = map_.store.read("session", 0)
                 info["config"]["fusion"]["voxel_m"] = 0.2
+                info["config"]["scene"]["scale"] = {"coarse": 1.0, "scaled": 2.0}[second]
                 map_.store.put("session", 0, info)
             elif second == "newer":
                 map_.store._database.execute("PRAGMA user_version = 99")

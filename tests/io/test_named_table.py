@@ -37,6 +37,7 @@ DEGREES = {
     "sides first": "time;lat;lon;alt\n1,5;N 52° 31' 12,3\";W13°24'18\";113,5\n".replace(",3", ".3"),
     "colons": "time lat lon alt\n1.5 52:31:12.3 -13:24:18 113.5\n",
     "primes": "time,lat,lon,alt\n1.5,52°31\u203212.3\u2033N,13°24\u203218\u2033W,113.5\n",
+    "typographic": "time,lat,lon,alt\n1.5,52°31\u201912.3\u201dN,13º24\u201918\u201dW,113.5\n",
     "quoted": 'time,lat,lon,alt\n1.5,"52°31\'12.3""N","13°24\'18""W",113.5\n',
 }
 REFUSED = {
@@ -48,7 +49,13 @@ REFUSED = {
     "time,easting (ft),northing (ft),height\n1,2,3,4\n": "got no east, north",
     "time,x (north),y (east),z\n1,2,3,4\n": "got no east, north",
     "time,e,n,h\n1,2,3\n": "t.csv:2: a row lacks a field",
-    "time,e,n,h\n1,2,x,4\n": "not a row of numbers",
+    "time,e,n,h\n1,2,x,4\n": "t.csv:2: not a row of numbers",
+    "time,e,n,h\n1,5,2,5,3,5,4,5\n": "t.csv:2: a row has more fields .*commas in decimals",
+    "point,time,e,n,h,fix\n,1,2,3,,4\n": "t.csv:2: not a row of numbers",
+    "1,5,2,5,3,5,4,5\n": "quaternion is not of unit length",
+    "1,2,3,4\n1,5,2,5,3,5,4,5\n": "t.csv:2: wrong number of columns",
+    "t;e;n;h\n0.5;455,810;429,311;113\n": "t.csv:2: decimals or thousands .got 0.5;455",
+    "t;e;n;h\n0;455.810;429.311;113\n1,5;2;3;4\n": "t.csv:2: decimals or thousands",
     "time,lat,lon,h\n1,52°31'12\"E,13°24'18\"E,4\n": "t.csv:2: not a lat",
     "time,lat,lon,h\n1,52°61'12\"N,13°24'18\"E,4\n": "not a row of numbers",
     "time,e,n,h\n": "no position",
@@ -79,6 +86,13 @@ def test_degrees_are_read_however_they_are_written(tmp_path, form):
     found = read_positions(written(tmp_path, DEGREES[form]))
     assert found.degrees
     np.testing.assert_allclose(found.places, [[LAT, LON, UP]], rtol=1e-14)
+
+
+def test_a_field_that_is_empty_moves_no_other(tmp_path):
+    text = "point,time,e,n,h,fix\n,1.5,455810.5,5429311.25,113.5,4\n"
+    np.testing.assert_array_equal(
+        read_positions(written(tmp_path, text)).places, [[EAST, NORTH, UP]]
+    )
 
 
 @pytest.mark.parametrize("text", REFUSED)
@@ -145,8 +159,15 @@ def test_control_points_in_degrees_with_check_points(tmp_path):
         (HEAD + "name,x,y,z,u,v,image\na,1,2,3,4,5\n", r"t\.csv:3: a row lacks a field"),
         (HEAD + "1 2 3 4 5 a.png a b\n", "not a control point"),
         (HEAD + "name,x,y,z,u,v,image\na,1,2,3,4,?,a.png\n", "not five numbers"),
+        (HEAD + "name,x,y,z,u,v,image,check\na,1,2,3,4,5,a.png,yes\n", "got yes, expected check"),
     ],
 )
 def test_control_points_that_lack_something_are_one_line(tmp_path, text, said):
     with pytest.raises(FormatError, match=said):
         read_control(written(tmp_path, text))
+
+
+def test_a_check_point_without_a_name_is_one(tmp_path):
+    text = "x,y,z,u,v,image,check\n1,2,3,4,5,a.png,check\n2,2,3,4,5,a.png,\n"
+    found = read_control(written(tmp_path, HEAD + text))
+    assert [one.check for one in found.points] == [True, False]

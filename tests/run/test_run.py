@@ -249,3 +249,37 @@ def test_a_folder_of_other_files_and_a_file_are_refused(tmp_path, inside, said):
     assert str(tmp_path / inside) in str(told.value)
     assert "\n" not in str(told.value)
     assert files_in(tmp_path) == {"thesis"}
+
+
+class TestMapInTheFolder:
+    @staticmethod
+    def made(out: Path, drives: int) -> bytes:
+        """A finished run with a map of so many drives; the bytes of that."""
+        (out / "map").mkdir(parents=True)
+        (out / "map" / "map.recon").write_bytes(b"a year")
+        (out / "summary.json").write_text(json.dumps({"sessions": [{}] * drives}))
+        files = ["map/map.recon", "summary.json", "run.json"]
+        (out / "run.json").write_text(json.dumps({"files": files}))
+        return b"a year"
+
+    @pytest.mark.parametrize(
+        ("kind", "command", "drives"),
+        [(WholeRun, "diff", 1), (Run, "batch", 3), (Run, "pair", 0), (Run, "map", 2)],
+    )
+    def test_it_is_not_lost_to_results_of_another_kind(self, tmp_path, kind, command, drives):
+        year = self.made(tmp_path / "out", drives)
+        one = "1 drive" if drives < 2 else f"{drives} drives"
+        with pytest.raises(OutputError, match=f"replace a map .got one of {one}.*--into adds"):
+            kind(command, tmp_path / "out").__enter__()
+        assert (tmp_path / "out/map/map.recon").read_bytes() == year
+        assert not (tmp_path / "out/.partial").exists()
+
+    @pytest.mark.parametrize(
+        ("kind", "command", "drives"),
+        [(Run, "map", 1), (Run, "demo", 0), (WholeRun, "merge", 3), (WholeRun, "map", 3)],
+    )
+    def test_another_map_takes_its_place(self, tmp_path, kind, command, drives):
+        self.made(tmp_path / "out", drives)
+        with kind(command, tmp_path / "out") as run:
+            run.finish(_Found(points=3), source="x", inputs=[])
+        assert not (tmp_path / "out/map/map.recon").exists()

@@ -172,14 +172,18 @@ def read_all(map_: MapFile) -> None:
 
 def check_session(session: Session, settings: DriveSettings) -> None:
     """Refuse a drive that cannot become part of a map with these settings."""
-    voxel_m = session.info.config.get("fusion", {}).get("voxel_m")
+    config = session.info.config
+    voxel_m = config.get("fusion", {}).get("voxel_m")
     if voxel_m != settings.fusion.voxel_m:
+        same = f"fusion.voxel_m={settings.fusion.voxel_m:g}"
+        if config.get("scene", {}).get("scale") != settings.scale:
+            same = f"scene.scale={settings.scale:g}"
         raise SettingsError(
             "the clouds of the maps have voxels of different sizes",
             where=session.where,
             got=f"{voxel_m} m",
             expected=f"{settings.fusion.voxel_m:g} m",
-            hint="map one again with --set scene.scale= or fusion.voxel_m= of the other",
+            hint=f"map it again with --set {same}, or into the run of the others with --into",
         )
     check_rays(session, settings)
 

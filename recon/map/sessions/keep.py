@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from recon.core.errors import SettingsError
+from recon.core.text import parse_numbers
 from recon.core.values.arrays import Bool, Float64
 
 DRIVES: Final = 2
@@ -35,8 +36,8 @@ class Keep:
         for text in texts:
             name, value = _condition(text)
             if not name or name in found or (found and "all" in (name, *found)):
-                what = "not what a map may keep"
-                expected = "drives (2), days (90d), X0,Y0,X1,Y1 in metres, each once; or all"
+                what, least = "not what a map may keep", "X0,Y0,X1,Y1 in metres, the least first"
+                expected = f"drives (2), days (90d), {least}, each once; or all"
                 raise SettingsError(what, where=where, got=text, expected=expected)
             found[name] = value
         found.pop("all", None)
@@ -53,7 +54,7 @@ class Keep:
 def _condition(text: str) -> tuple[str, Any]:
     """Return which condition a text is, "" = none, and its value."""
     try:
-        numbers = [float(part) for part in text.removesuffix("d").split(",")]
+        numbers = parse_numbers(text.removesuffix("d").split(","))
     except ValueError:
         return ("all" if text == "all" else ""), None
     match numbers if np.isfinite(numbers).all() else [], text.endswith("d"):

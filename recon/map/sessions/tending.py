@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.core.dates import DAY_S
+from recon.core.errors import SettingsError
 from recon.core.geometry.se3 import adjoint, apply, invert
 from recon.core.kernels.voxels import are_among, find_keys, pack_keys, unpack_keys
 from recon.core.progress import tracked
@@ -72,6 +73,9 @@ def tend(map_: MapFile, settings: DriveSettings, keep: Keep) -> str:
         voxels = sum(entry.voxels for entry in session.submaps.entries)
         if not (thinned.rays or thinned.keyframes or voxels or session is map_.first):
             leaving.add(number)
+    if rays and not left:
+        hint = "a region is in metres of the map, days are before its newest drive"
+        raise SettingsError("the map would keep nothing", where="--keep", hint=hint)
     if leaving:
         forget(map_, leaving)
     parts = [f"{len(leaving)} of {counted(before, 'drive')}"] if leaving else []

@@ -162,6 +162,16 @@ def test_a_region_keeps_what_lies_in_it_alone():
             assert z.max() <= 20.0 + 1e-6
 
 
+@pytest.mark.parametrize(
+    "keep", [Keep(region=(500.0, 0.0, 501.0, 1.0)), Keep(1, None, (-9, 90, 0, 99))]
+)
+def test_a_region_without_anything_is_refused_and_nothing_else_done(keep):
+    map_ = street((0.0, 12.0))
+    with pytest.raises(SettingsError, match="--keep: the map would keep nothing"):
+        tend(map_, CONFIG, keep)
+    assert len(map_.sessions) == 2
+
+
 def dated(session: Session, text: str) -> None:
     session.info = replace(session.info, date=text, date_from="given")
     session._store.put(SESSION, session.number, asdict(session.info))
@@ -209,7 +219,7 @@ def test_conditions_are_read_as_people_write_them():
 @pytest.mark.parametrize(
     "texts",
     [["0"], ["1.5"], ["-3"], ["nan"], ["infd"], ["d"], [""], ["1,2,3"], ["5,0,1,9"], ["x"],
-     ["3", "2"], ["all", "3"], ["3", "all"], ["-1d"], ["1,2,3,4d"]],
+     ["3", "2"], ["all", "3"], ["3", "all"], ["-1d"], ["1,2,3,4d"], ["1_0"], ["\uff12"]],
 )  # fmt: skip
 def test_what_is_no_condition_is_refused_in_one_line(texts):
     with pytest.raises(SettingsError, match=r"--keep.*not what a map may keep") as caught:

@@ -158,3 +158,12 @@ def test_what_is_no_run_is_one_line(tmp_path, text):
     (out / "summary.json").write_text(text)
     with pytest.raises(ReconError, match=r"a/summary\.json"):
         runs_by_date([out], tmp_path)
+
+
+def test_a_table_never_takes_the_place_of_a_run_that_it_is_of(weeks, tmp_path):
+    before = {path: path.read_bytes() for path in weeks[0].rglob("*") if path.is_file()}
+    words = ["batch", "--table", *map(str, weeks), "--out", str(weeks[0])]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 1
+    assert "w0: the results would replace the run; another --out" in " ".join(done.output.split())
+    assert before == {path: path.read_bytes() for path in weeks[0].rglob("*") if path.is_file()}
