@@ -8,8 +8,9 @@ is `free` then. It is found if the box of an object of its kind overlaps its own
 replaced, of either kind. An object is false if its box overlaps nothing that changed: cars,
 hoarding, fence, the growing tree; crowns of trees, where leaves are of another season.
 
-WEEKS has the weeks as folders (image_2, image_3, calib.txt, times.txt, T_street_first.npy), or they
-are rendered; RUNS their maps, which are made where they are missing.
+WEEKS has the weeks as folders (image_0, image_1, calib.txt, times.txt, T_street_first.npy), as
+`benchmarks/year.py` writes them, or they are rendered; RUNS their maps, which are made where they
+are missing.
 
 Of HALVES, two runs of one drive, nothing but what drives may be found; all objects are counted.
 
