@@ -37,6 +37,7 @@ STAYS: Box = ((4.0, 0.0, 10.0), SIZE)
 WENT: Box = ((4.0, 0.0, 17.0), SIZE)
 CAME: Box = ((-4.0, 0.0, 10.0), SIZE)
 MOVED: tuple[Box, Box] = ((-4.0, 0.0, 17.0), SIZE), ((-4.0, 0.0, 19.1), SIZE)
+REPLACED: tuple[Box, Box] = ((4.0, 0.0, 3.5), SIZE), ((3.8, 0.0, 3.6), SIZE)
 HIDDEN: Box = ((8.0, 0.0, 20.0), (1.0, 1.2, 2.0))
 SCREEN: Box = ((6.5, 0.0, 19.5), (0.3, 3.0, 8.0))
 
@@ -83,8 +84,8 @@ def objects_at(found: Comparison, box: Box, change: str) -> list[ChangedObject]:
 
 @pytest.fixture(scope="module")
 def changed() -> Comparison:
-    before = [STAYS, WENT, MOVED[0], HIDDEN]
-    return days(before, [STAYS, CAME, MOVED[1], HIDDEN, SCREEN], off_m=0.03)
+    before = [STAYS, WENT, MOVED[0], REPLACED[0], HIDDEN]
+    return days(before, [STAYS, CAME, MOVED[1], REPLACED[1], HIDDEN, SCREEN], off_m=0.03)
 
 
 class TestCompare:
@@ -101,7 +102,7 @@ class TestCompare:
     def test_what_stays_is_the_same_and_nothing_else_is_found(self, changed):
         assert not objects_at(changed, STAYS, "came")
         assert not objects_at(changed, STAYS, "went")
-        known = [WENT, CAME, SCREEN, *MOVED]
+        known = [WENT, CAME, SCREEN, *MOVED, *REPLACED]
         real = [
             one
             for box in known
@@ -113,6 +114,10 @@ class TestCompare:
     def test_what_moved_by_half_its_length_went_at_one_end_and_came_at_the_other(self, changed):
         assert objects_at(changed, MOVED[0], "went")
         assert objects_at(changed, MOVED[1], "came")
+
+    def test_what_stands_a_voxel_beside_its_place_was_replaced(self, changed):
+        assert objects_at(changed, REPLACED[0], "went")
+        assert objects_at(changed, REPLACED[1], "came")
 
     def test_what_was_hidden_is_not_compared(self, changed):
         assert not objects_at(changed, HIDDEN, "went")

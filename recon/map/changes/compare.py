@@ -5,8 +5,9 @@ as later; what came is the same with the days swapped. So what either day saw ba
 and what lies within the error of depths of a surface, is no change: `recon.map.occupancy.moving`.
 What moved within a day is in neither of its clouds. A point is the same, in any case, where the
 other day has one as near as two voxels and the error of depths explain: a roof seen at a grazing
-angle is looked through as one body. What is neither was not compared: the other day did not look
-there, or not so that it could tell.
+angle is looked through as one body. But not where surfaces were displaced by more than the error
+that the map has (`displaced.py`): one replaced the other. What is neither was not compared: the
+other day did not look there, or not so that it could tell.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from recon.core.errors import MappingError
 from recon.core.values import PointCloud, join_clouds
 from recon.core.values.arrays import Float32, UInt8
 from recon.map.builders import FREE_MARGIN_SIGMAS, Submap
+from recon.map.changes.displaced import find_displaced
 from recon.map.changes.objects import CAME, NOT_COMPARED, SAME, WENT, ChangedObject, Day, objects_of
 from recon.map.occupancy.bodies import FrameObservations
 from recon.map.occupancy.moving import find_moved
@@ -97,10 +99,15 @@ def compare(map_: MapFile, newer: Sequence[int], threads: int = 1) -> Comparison
         cloud = join_clouds(part for part, _ in parts)
         classes = np.concatenate([np.zeros(0, np.uint8), *(found for _, found in parts)])
         seen = cast("FrameObservations", own[n].observations)  # all have rays
-        days.append(Day(sides[n], seen, cloud, classes))
+        days.append(Day(sides[n], seen, cloud, classes, np.zeros(len(cloud), np.bool_)))
     before, after = days
     if not (len(before.cloud) or len(after.cloud)):
         raise MappingError("neither map has a point to compare", where=map_.store.name)
+    displaced = find_displaced(before.cloud, after.cloud, own[0].resolution_m)
+    before, after = (
+        replace(day, classes=np.where(off, np.uint8(kind), day.classes), displaced=off)
+        for day, off, kind in zip(days, displaced, (WENT, CAME), strict=True)
+    )
     found = [*objects_of(before, after, WENT), *objects_of(after, before, CAME)]
     found.sort(key=lambda changed: -changed.points)
     return Comparison(before, after, [replace(one, number=n) for n, one in enumerate(found, 1)])

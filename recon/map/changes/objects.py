@@ -20,30 +20,32 @@ from scipy.ndimage import binary_erosion
 from scipy.spatial import cKDTree
 
 from recon.core.dates import date_of_stamp
-from recon.core.kernels.voxels import pack_keys
 from recon.core.progress import tracked
 from recon.core.summary import Figures, hidden
 from recon.core.values import PointCloud
-from recon.core.values.arrays import Float32, Float64, Int64, UInt8
+from recon.core.values.arrays import Bool, Float64, Int64, UInt8
+from recon.map.changes.displaced import GAP_CELLS, PATCH, cells_of
 from recon.map.occupancy.bodies import FrameObservations, pieces_of
 from recon.map.store.session import Session
 
 CLASSES: Final = ("same", "came", "went", "not compared")
 SAME, CAME, WENT, NOT_COMPARED = range(4)
-_GAP_CELLS: Final = 2.5  # between cells of a piece; those of a body have gaps of two
-_PATCH: Final = 9  # cells of a surface that err together
 _WAYS: Final = math.e * 8  # to join a patch: so many touch it
 _BY_CHANCE: Final = 0.1  # pieces in a map
 
 
 @dataclass(frozen=True, eq=False)
 class Day:
-    """Drives, what they saw, and their cloud, map axes, with the class of each point (N,)."""
+    """Drives, what they saw, and their cloud, map axes, with the class of each point (N,).
+
+    ``displaced`` (N,) are those of surfaces that another one replaced (`find_displaced`).
+    """
 
     sessions: Sequence[Session]
     observations: FrameObservations
     cloud: PointCloud
     classes: UInt8
+    displaced: Bool
 
     @property
     def not_compared_ratio(self) -> float:
@@ -86,18 +88,21 @@ class ChangedObject(Figures):
 
 def objects_of(own: Day, other: Day, kind: int) -> list[ChangedObject]:
     """Return the objects of a day among its points of the class ``CAME`` or ``WENT``."""
-    seen, cloud = own.observations, own.cloud.select(own.classes == kind)
+    seen, chosen = own.observations, own.classes == kind
+    cloud = own.cloud.select(chosen)
     cell_m = seen.settings.resolution_m
-    keys, home = np.unique(_cells(cloud.xyz, cell_m), return_inverse=True)
+    keys, home = np.unique(cells_of(cloud.xyz, cell_m), return_inverse=True)
     if not len(keys):
         return []
     middles = np.stack([np.bincount(home, axis) for axis in cloud.xyz.T], axis=1)
     tree = cKDTree(middles / (np.bincount(home)[:, None] * cell_m))
-    pairs = tree.query_pairs(_GAP_CELLS, output_type="ndarray").astype(np.int64)
+    pairs = tree.query_pairs(GAP_CELLS, output_type="ndarray").astype(np.int64)
     piece = pieces_of(len(keys), pairs)
     sizes = np.bincount(piece)
-    compared = len(np.unique(_cells(own.cloud.xyz[own.classes != NOT_COMPARED], cell_m)))
-    enough = sizes >= least_cells(int((sizes <= _PATCH).sum()), compared)
+    compared = len(np.unique(cells_of(own.cloud.xyz[own.classes != NOT_COMPARED], cell_m)))
+    displaced = np.bincount(piece[home], own.displaced[chosen]) > 0  # no chance, however small
+    small = int((sizes[~displaced] <= PATCH).sum())
+    enough = displaced | (sizes >= least_cells(small, compared))
     hits = np.zeros((len(seen.frames), len(sizes)), np.int64)
     for frame, look in tracked(seen.by_frame(keys), "frames", f"see what {CLASSES[kind]}"):
         hits[frame] = np.bincount(piece[look > 0], minlength=len(sizes))
@@ -110,10 +115,10 @@ def objects_of(own: Day, other: Day, kind: int) -> list[ChangedObject]:
 def least_cells(small: int, compared: int) -> int:
     """Return how many cells a piece has that is no chance, where so many are small."""
     small += 3  # so many may be expected where none was seen, at 95 %
-    joined = _WAYS * small * _PATCH / max(compared, 1)
+    joined = _WAYS * small * PATCH / max(compared, 1)
     if joined >= 1:
         return compared + 1
-    return 1 + _PATCH * max(1, math.ceil(math.log(_BY_CHANCE / small) / math.log(joined)))
+    return 1 + PATCH * max(1, math.ceil(math.log(_BY_CHANCE / small) / math.log(joined)))
 
 
 def _object(own: Day, other: Day, cloud: PointCloud, hits: Int64, kind: int) -> ChangedObject:
@@ -167,7 +172,3 @@ def _volume(
     error_m = math.hypot(*(float(np.median(one)) for one in sigmas))
     variance = (covered * error_m) ** 2 + np.where(whole, 0.0, height_m**2 / 12)
     return float(height_m @ covered) * cell_m**2, float(np.sqrt(variance.sum())) * cell_m**2
-
-
-def _cells(xyz: Float32, cell_m: float) -> Int64:
-    return pack_keys(np.floor(xyz / cell_m).astype(np.int64))
