@@ -182,7 +182,7 @@ class TestRefused:
         self.refused(files, tmp_path, MappingError, "no place is seen to be")
 
     def test_the_same_run_twice(self, files, tmp_path):
-        self.refused([files[0]] * 2, tmp_path, MappingError, "no drive that the first one lacks")
+        self.refused([files[0]] * 2, tmp_path, MappingError, "both maps are of the same drives")
 
     def test_a_missing_and_a_damaged_map(self, files, tmp_path):
         self.refused([files[0], tmp_path / "nothing"], tmp_path, FormatError, "does not exist")

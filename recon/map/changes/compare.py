@@ -63,7 +63,9 @@ def gather(map_: MapFile, before: MapFile, after: MapFile) -> list[int]:
     known, where = same_drives(before, after), after.store.name
     if len(known) == len(after.sessions):
         what = "the second map has no drive that the first one lacks"
-        raise MappingError(what, where=where, hint="name the older one first")
+        older = len(before.sessions) > len(known)
+        hint = "name the older one first" if older else "both maps are of the same drives"
+        raise MappingError(what, where=where, hint=hint)
     copy_sessions(before, map_)
     new = copy_sessions(after, map_, without=known)
     join_new(map_, new)
