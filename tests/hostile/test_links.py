@@ -285,6 +285,7 @@ def test_results_replace_no_input(command, out, finished, good_state):
     for name in ("map/cloud.ply", "trajectory_tum.txt"):
         Path("linked", name).unlink()
         Path("linked", name).hardlink_to(finished / name)
+    Path(out, "map/map.recon").unlink()  # in place of a map there is nothing at all
     before = state(Path(out))
     assert_refused(run(*MADE_OF[command].split(), "--out", out), "would replace an input")
     assert state(Path(out)) == before
@@ -292,6 +293,7 @@ def test_results_replace_no_input(command, out, finished, good_state):
 
 def test_results_do_not_replace_what_is_no_regular_file(finished):
     shutil.copytree(finished, "other")
+    Path("other/map/map.recon").unlink()
     Path("other/map/cloud.ply").unlink()
     os.mkfifo("other/map/cloud.ply")
     before = state(Path("other"))
