@@ -170,7 +170,8 @@ T_street_map = [
 T_first_map = [np.eye(4), np.linalg.inv(T_street_map[0]) @ T_street_map[1]]
 exported = [moved(T, xyz_of(one)) for T, one in zip(T_first_map, clouds, strict=True)]
 
-# Same points have a point of the other day near; those that came and went have none.
+# Same points have a point of the other day near; those that came and went have none: no surface in
+# this street is displaced by less than that.
 settings = (runs[0] / "config.yaml").read_text()
 voxel_m, doublings = (
     float(re.search(rf"^ *{name}: (\S+)", settings, re.MULTILINE)[1])
@@ -221,7 +222,7 @@ for kind in KINDS:
 must([one["number"] for one in objects] == [*range(1, len(objects) + 1)], "numbers of objects")
 counts = [one["points"] for one in objects]
 must(counts == sorted(counts, reverse=True), "objects are not in the order of their points")
-matched = set()
+matched, pieces = set(), {}
 for row, one in zip(rows, objects, strict=True):
     label = f"object {one['number']} ({one['change']})"
     for name, value in one.items():
@@ -260,6 +261,7 @@ for row, one in zip(rows, objects, strict=True):
         if abs(high[2] + low[2] - 2 * one["centre_m"][2]) < 1e-4:
             fits.append((name, its, int((piece == name).sum())))
     must(len(fits) == 1, f"{label}: {len(fits)} pieces of {one['points']} points at its height")
+    pieces[one["number"]] = fits[0][1]
     name, its, cells = fits[0]
     must((kind, name) not in matched, f"{label}: another object has the same points")
     matched.add((kind, name))
@@ -323,15 +325,10 @@ for row, one in zip(rows, objects, strict=True):
 
 
 # What there is in truth.
-def corners_of(one):
-    signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2
-    size = np.array([one["length_m"], one["width_m"], one["height_m"]])
-    corners = np.array(one["centre_m"]) + signs * size @ axes_of(one)
-    street = moved(T_street_map[0], corners)
-    return street.min(axis=0), street.max(axis=0)
-
-
-found = {one["number"]: corners_of(one) for one in objects}
+found = {
+    number: (street.min(axis=0), street.max(axis=0))
+    for number, street in ((n, moved(T_street_map[0], its)) for n, its in pieces.items())
+}
 hits = []
 for box in truth["boxes"]:
     low, high = np.array(box["low_m"]), np.array(box["high_m"])
