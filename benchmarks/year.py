@@ -103,7 +103,7 @@ class Year:
     """The maps of a year in a folder; ``rows`` are what was measured, by map and week."""
 
     def __init__(self, folder: Path, names: Sequence[str], weeks: int) -> None:
-        self.folder, self.timed = folder, sorted({1, weeks - 1} - {0})
+        self.folder, self.timed = folder, sorted({1, weeks - 1} & {*range(1, weeks)})
         for name in (*KEPT.values(), "found", "products", "before", "again"):
             shutil.rmtree(folder / name, ignore_errors=True)
         self.files = {name: folder / each / MAP_FILE for name, each in KEPT.items()}

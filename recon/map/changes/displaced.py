@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from recon.core.kernels.voxels import pack_keys
+from recon.core.progress import tracked
 from recon.core.values import PointCloud
 from recon.core.values.arrays import Bool, Float32, Float64, Int64
 from recon.map.occupancy.bodies import pieces_of
@@ -103,7 +104,7 @@ class _Patches:
         trees = cKDTree(own.xyz), cKDTree(other.xyz)
         parts = [
             _compared(middles[first : first + _AT_ONCE], (own, other), trees, cell_m)
-            for first in range(0, len(middles), _AT_ONCE)
+            for first in tracked(range(0, len(middles), _AT_ONCE), "parts", "compare surfaces")
         ]
         return cls(cell_m, middles / cell_m, home, *map(np.concatenate, zip(*parts, strict=True)))
 
